@@ -25,14 +25,9 @@ def read_cameras(folder: str | os.PathLike[str], within: Path | None = None) -> 
     pinhole views; of a panorama there are six, named `<stem>_front` and so on: see `Camera.undistortion`. With
     `within`, the files must lie below that folder, links followed.
 
-    Raises
-    ------
-    CameraFileError
-        No cameras are there, or a file is broken, or two images share a stem.
-    PoseError, IntrinsicsError
-        A camera is unusable, or its lens is of no known model.
-    PathNotAllowedError
-        A file lies outside `within`.
+    Raises `CameraFileError` where there are no cameras, a file is broken or two images still share a name, `PoseError`
+    or `IntrinsicsError` where a camera is unusable or its lens of no known model, `PathNotAllowedError` where a file
+    lies outside `within`.
     """
     folder = Path(folder)
     found = _find(folder)
@@ -66,25 +61,10 @@ def _named(cameras: list[Camera]) -> list[Camera]:
 
 
 def frame_of_training(folder: Path, dataparser: Path) -> Similarity | None:
-    """Read what nerfstudio did to the cameras of a dataset folder before it trained on them.
+    """Read how nerfstudio moved the cameras of a dataset folder before it trained on them: from theirs to its frame.
 
-    Parameters
-    ----------
-    folder : pathlib.Path
-        The dataset.
-    dataparser : pathlib.Path
-        The `dataparser_transforms.json` beside the trained config.
-
-    Returns
-    -------
-    Similarity or None
-        From the frame of the cameras to that of the Gaussians; None if the cameras are of a format that nerfstudio does
-        not train from.
-
-    Raises
-    ------
-    CameraFileError, PoseError
-        A file is missing or broken.
+    `dataparser` is the `dataparser_transforms.json` beside the trained config. None if the cameras are of a format that
+    nerfstudio does not train from; raises `CameraFileError` or `PoseError` where a file is missing or broken.
     """
     found = _find(folder)
     if found is None or found[0].frame_of_training is None:

@@ -1,7 +1,7 @@
 """Names of classes and views: read from `classes.json`, checked, and looked up.
 
-What is named ends up in file names, pictures, reports and on terminals, long after it was read. So a name is looked at
-where it comes in, before anything is learnt.
+Names end up in file names, pictures, reports and on terminals, long after they were read. So they are checked where
+they come in, before anything is learnt.
 """
 
 from __future__ import annotations
@@ -19,11 +19,8 @@ from gsseg_core.text import clipped, quoted
 
 BACKGROUND_NAME = "background"
 
-MAX_CLASS_NAME = 200
-"""Characters of a class name."""
-
-MAX_VIEW_NAME = 240
-"""Bytes of a view's name, in UTF-8: files are called after it, and a file name has 255 at most."""
+MAX_CLASS_NAME = 200  # characters
+MAX_VIEW_NAME = 240  # bytes in UTF-8: files are called after views, and a file name has 255 at most
 
 _LISTED = 20
 
@@ -31,13 +28,9 @@ _LISTED = 20
 def read_classes(path: str | os.PathLike[str], within: Path | None = None) -> dict[int, str]:
     """Read `classes.json`, an object from id to name; sorted by id, 0 being "background" unless named otherwise.
 
-    With `within`, the file must lie below that folder, links followed (else `PathNotAllowedError`).
-
-    Raises
-    ------
-    ClassesFileError
-        The file is missing or broken, an id is not a whole number from 0 to 65534, or a name is not one line of text
-        of at most 200 characters.
+    With `within`, the file must lie below that folder, links followed (else `PathNotAllowedError`). Raises
+    `ClassesFileError` where it is missing or broken, an id is not a whole number from 0 to 65534, or a name is not one
+    line of text of at most 200 characters.
     """
     path = Path(path)
     content = read_object(path, ClassesFileError, 'an object such as {"1": "chair"}', within)
@@ -59,9 +52,9 @@ def class_name(names: Mapping[int, str], k: int) -> str:
 def check_same_names(
     names: Mapping[int, str], known: Mapping[int, str], source: object, where: str, error: type[GssegError]
 ) -> None:
-    """Raise `error` if the names of a source call a class otherwise than it is called elsewhere.
+    """Raise `error` if a source names a class otherwise than `known` does, which are the names `where` says.
 
-    Names like "class_07", which were made up where there were none, may be any.
+    Names like "class_07", which were made up where there were none, fit any other.
     """
     for k in sorted(names.keys() & known.keys()):
         here, there = names[k], known[k]
@@ -107,12 +100,8 @@ def meant_by(text: str, class_names: Mapping[int, str]) -> list[int]:
 def class_ids(wanted: Iterable[str], class_names: Mapping[int, str], source: object = "") -> list[int]:
     """Look up classes by id or name: their ids in the order asked for, each once.
 
-    A number is the id of a class where there is one; everything else is a name. Errors begin with the `source`, if any.
-
-    Raises
-    ------
-    SettingsError
-        There is no such class, or several have this name.
+    A number is the id of a class where there is one; everything else is a name. Raises `SettingsError`, whose message
+    begins with the `source`, if any, where there is no such class, or several have this name.
     """
     ids, where = [], f"{source}: " if source else ""
     for name in wanted:

@@ -17,7 +17,7 @@ from gsseg_core.data.label_images import GLOBAL, PER_VIEW
 from gsseg_core.data.label_map import read_label_map
 from gsseg_core.data.mask_files import masks_below, read_supervises
 from gsseg_core.data.mask_formats.masks import MaskSet
-from gsseg_core.data.mask_formats.place import SUPERVISES, view_of, with_folders
+from gsseg_core.data.mask_formats.place import SUPERVISES, possible_stems, view_of
 from gsseg_core.data.mask_formats.table import LABEL_IMAGES, open_masks
 from gsseg_core.data.view import View
 from gsseg_core.errors import ClassesFileError, SettingsError, SplitFileError
@@ -94,8 +94,8 @@ class Dataset:
         """Find photos by the names of images, among those that are listed in `images`."""
         folder, names = self.root / "images", {camera.image for camera in self.cameras}
         photos = [path for path in listed(folder, self._within) if path.suffix.lower() in READABLE_IMAGES]
-        named = ((with_folders(str(path.relative_to(folder).with_suffix(""))), path) for path in photos)
-        return {name: path for names_of_path, path in named for name in names_of_path if name in names}
+        stems = ((possible_stems(str(path.relative_to(folder).with_suffix(""))), path) for path in photos)
+        return {name: path for stems_of_path, path in stems for name in stems_of_path if name in names}
 
     def _take_own_masks(self, folder: Path, images: list[str]) -> None:
         """Find the masks of images, by their stems, in gsseg's own forms."""
@@ -202,12 +202,8 @@ class Dataset:
 def _read_split(path: Path, cameras: Sequence[Camera], within: Path | None = None) -> dict[str, list[str]]:
     """Read `split.json`, stems of images by "train" and "test", as names of views; without it, all are for training.
 
-    Raises
-    ------
-    SplitFileError
-        The file is broken, names a view without a camera, or one twice.
-    PathNotAllowedError
-        Links lead out of the folder `within`.
+    Raises `SplitFileError` where it is broken, names a view without a camera, or one twice, and `PathNotAllowedError`
+    where it lies outside `within`.
     """
     if not is_there(path, SplitFileError):
         return {"train": [camera.name for camera in cameras], "test": []}

@@ -1,6 +1,6 @@
 """Hints at the end of error messages: where the cameras or masks are that a dataset folder lacks, and what to type.
 
-Nothing here decides anything: the folder was refused already. What is told is what lies near to what was looked for.
+The folder was refused already; a hint tells of cameras or masks that lie near the place where they were looked for.
 """
 
 from __future__ import annotations
@@ -100,7 +100,7 @@ def _has_cameras(folder: Path) -> bool:
 
 
 def _folders(root: Path) -> list[Path]:
-    """List the folders below one, the nearest first; a capture may be large, so neither all the way nor all of them."""
+    """List folders below one, the nearest first, to a depth and up to a number: a capture may be large."""
     found: list[Path] = []
     level = [root]
     for _ in range(_DEPTH):

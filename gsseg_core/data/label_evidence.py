@@ -9,10 +9,10 @@ of all sets that it is in, is the label's likelihood, and all that learning asks
     pl(c) = m_c + r [c in A].
 
 The segmenter's *vocabulary* is what it can answer: the classes that have a mass, and "none of these" if some label says
-so. Confusion matrices have a column for each word of it, so they do not grow with the number of prototypes. A label
-that has lost its name is a word of its own: no vote for any class, but its pixels still belong together, and the
-confusion matrix tells which class they are of. Votes go to the classes that a label names, m_c; the rest is a vote for
-no class, but counts against those that were looked for and not found, m_c - r [c in S].
+so. Confusion matrices have a column for each word of it, so they do not grow with the number of prototypes. A nameless
+label, one whose class is no longer believed, is a word of its own: it votes for no class, but its pixels still belong
+together, and the confusion matrix tells which class they are of. Votes go to the classes that a label names, m_c; the
+rest is a vote for no class, but counts against those that were looked for and not found, m_c - r [c in S].
 """
 
 from __future__ import annotations
@@ -67,13 +67,13 @@ class LabelEvidence:
         return np.asarray(self.mass.any(axis=1))
 
     def without_names(self, labels: np.ndarray) -> LabelEvidence:  # (L,) bool
-        """Make these labels words of their own, of a mask that `is_certain`; `named` still tells what they were."""
+        """Make these labels of a mask that `is_certain` nameless; `named` still tells their class."""
         mass = np.eye(len(self.classes), dtype=np.float32) if self.mass is None else self.mass
         return LabelEvidence(self.classes, mass, nameless=labels)
 
     @cached_property
     def former_words(self) -> np.ndarray:
-        """Word that each nameless label was before, (V,) int64: its position in the vocabulary."""
+        """Word of the class that each nameless label had, (V,) int64: its position in the vocabulary."""
         return np.searchsorted(self.classes, self.named()[self.nameless] if self.nameless is not None else [])
 
     @property
@@ -156,5 +156,5 @@ class LabelEvidence:
 
 @called_by_kernels
 def vote_units(weight: np.float32, votes: np.float64, units: float) -> np.int64:
-    """Round a (Gaussian, label) pair's votes for a class to whole units: everywhere the same, so sums stay exact."""
+    """Round a (Gaussian, label) pair's votes for a class to whole units; all code rounds here, so sums stay exact."""
     return np.int64(np.rint(np.float64(weight) * votes * units))

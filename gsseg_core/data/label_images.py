@@ -42,14 +42,8 @@ def read_mask(path: str | os.PathLike[str], within: Path | None = None) -> Mask:
     """Read a label image: a PNG with 8- or 16-bit gray values, or palette indices, as labels.
 
     Its labels (H, W) int32 are `UNKNOWN` where the file has 255 (8 bits) or 65535 (16 bits). With `within`, it must lie
-    below that folder, links followed.
-
-    Raises
-    ------
-    MaskFormatError
-        The file is missing, broken, or another kind of image (RGB, alpha, 1-bit, not a PNG).
-    PathNotAllowedError
-        It lies elsewhere.
+    below that folder, links followed (else `PathNotAllowedError`). Raises `MaskFormatError` where it is missing or
+    broken, or another kind of image (RGB, alpha, 1-bit, not a PNG).
     """
     bits = mask_header(path, within).bits
     # Other formats are lossy or ambiguous about integers, whatever the file is named.
@@ -109,16 +103,10 @@ def write_mask(
     bits: int,
     run: str | None = None,
 ) -> None:
-    """Write a label image as a gray PNG of 8 or 16 bits, atomically; `UNKNOWN` becomes 255 or 65535.
+    """Write a label image as a gray PNG of 8 or 16 bits, atomically (`WriteError`); `UNKNOWN` becomes 255 or 65535.
 
-    `run` is the id of the run that it belongs to, for a text in the file.
-
-    Raises
-    ------
-    MaskFormatError
-        A label does not fit.
-    WriteError
-        The file cannot be written.
+    `run` is the id of the run that it belongs to, for a text in the file. Raises `MaskFormatError` where a label does
+    not fit, `SettingsError` for other bits.
     """
     if bits not in (8, 16):
         raise SettingsError(f"{path}: masks of {bits} bits were asked for; expected 8 or 16")

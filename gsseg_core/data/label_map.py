@@ -44,14 +44,8 @@ def read_label_map(
 ) -> LabelMap:
     """Read a label map, JSON or (.yaml, .yml) YAML, for masks with these classes.
 
-    Raises
-    ------
-    LabelMapError
-        The file is missing or broken, or names a class that there is not.
-    PathNotAllowedError
-        It lies outside `within`.
-    SettingsError
-        It is YAML, and PyYAML is not installed.
+    Raises `LabelMapError` where it is missing or broken or names a class that there is not, `PathNotAllowedError` where
+    it lies outside `within`, `SettingsError` where it is YAML and PyYAML is not installed.
     """
     return map_labels(read_new_names(path, within), class_names, str(path))
 
@@ -72,10 +66,7 @@ def read_new_names(path: str | os.PathLike[str], within: Path | None = None) -> 
 def map_labels(given: Mapping[str, str | None], class_names: Mapping[int, str], source: str) -> LabelMap:
     """Apply what a label map says, new names (None: ignored) by id, name or "*", to classes.
 
-    Raises
-    ------
-    LabelMapError
-        It names a class that there is not, or more than there are labels.
+    Raises `LabelMapError` where it names a class that there is not, or would need more ids than there are labels.
     """
     renamed: dict[int, str | None] = dict.fromkeys(class_names, given[_OTHERS]) if _OTHERS in given else {}
     # Ids after names, since an id says which of several classes of one name is meant.

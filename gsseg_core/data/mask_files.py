@@ -32,12 +32,7 @@ _ANY = "*"
 def mask_files(folder: Path, stems: Iterable[str], within: Path | None = None) -> dict[str, Path]:
     """Find the masks of views: `<stem>.png`, `<stem>.npz` or the folder `<stem>`; else a file by `view_of`.
 
-    Raises
-    ------
-    MaskFormatError
-        A view has masks of two kinds.
-    PathNotAllowedError
-        The folder lies outside `within`.
+    Raises `MaskFormatError` where a view has two masks, `PathNotAllowedError` where the folder lies outside `within`.
     """
     found: dict[str, Path] = {}
     wanted, others = set(stems), []
@@ -91,15 +86,9 @@ def read_supervises(
 ) -> dict[str, tuple[int, ...]]:
     """Read which classes were looked for in each label image: `{"*": [1, 3], "frame_0007": [2]}`; none without a file.
 
-    A stem's own entry goes before that of "*", which is for all label images without one.
-
-    Raises
-    ------
-    SupervisesFileError
-        The file is broken, or names a view without a camera, a mask that is no label image, or a class that there is
-        not.
-    PathNotAllowedError
-        It lies outside `within`.
+    The entry of "*" is for all label images without one of their own. Raises `SupervisesFileError` where the file is
+    broken, or names a view without a camera, a mask that is no label image, or a class that there is not, and
+    `PathNotAllowedError` where it lies outside `within`.
     """
     if not is_there(path, SupervisesFileError):
         return {}
@@ -128,15 +117,9 @@ def read_soft_mask(
     """Read probabilities (.npz) or a folder of detections.
 
     With `class_names`, an npz without `classes` must have a probability for each id up to the largest. With a camera,
-    the mask must have its size, which is found out before any pixel is read. With `within`, it must lie below that
-    folder, links followed.
-
-    Raises
-    ------
-    MaskFormatError, MaskSizeError, UnknownLabelError
-        It is missing or broken, or holds something else; see docs/masks.md.
-    PathNotAllowedError
-        It lies elsewhere.
+    the mask must have its size, which is checked before any pixel is read. With `within`, it must lie below that
+    folder, links followed (else `PathNotAllowedError`). Raises `MaskFormatError`, `MaskSizeError` or
+    `UnknownLabelError` where it is missing or broken, or not as docs/masks.md says.
     """
     if path.is_dir():
         return _read_detections(path, camera, within)

@@ -1,9 +1,9 @@
 """Parts, objects and wholes as a tree of nodes, and the levels at which it can be cut.
 
-Nodes below the number of classes K are the classes: node k is class k, on every level where it is not cut or put
-together with others. Nodes from K on are parts, inside one class each, and wholes, made of several. Every Gaussian lies
-in a leaf. A node is one thing at each granularity up to its agreement, which grows on the way from the root to a leaf;
-so every level is a union of the nodes of each finer one, and the level of the objects is one of them.
+Node k below the number of classes K is class k. Nodes from K on are parts, inside one class each, and wholes, made of
+several. Every Gaussian lies in a leaf. A node is one thing at each granularity up to its agreement; above, it comes
+apart. Agreement grows on the way from the root to a leaf, so levels are nested: each node of one is a union of nodes of
+every finer one. The level of the objects is one of them.
 """
 
 from __future__ import annotations
@@ -30,13 +30,13 @@ class ObjectTree:
     """Which parts the objects of a scene have, and which wholes they make."""
 
     parents: np.ndarray  # (M,) int32: node that each node is a part of; -1 for those that are of none
-    agreement: np.ndarray  # (M,) float32: share of the views' say by which all that it holds has one id; 1 for leaves
+    agreement: np.ndarray  # (M,) float32: share of the views, weighted, that give all of a node one id; 1 for leaves
     leaves: np.ndarray  # (N,) int32: leaf of each Gaussian; -1 where it is of no class
     num_classes: int  # K; the first nodes are the classes, the background among them
     level: float  # granularity of the classes, in (0, 1)
 
     def __post_init__(self) -> None:
-        """Raise `UnfitError` unless it is a tree whose nodes are nested as the docstring of the module says."""
+        """Raise `UnfitError` unless it is a tree with nodes nested as the docstring of the module says."""
         m, k = len(self.parents), self.num_classes
         nodes = np.arange(m)
         has = self.parents >= 0
@@ -123,33 +123,29 @@ class ObjectTree:
         return f"{'parts' if granularity > self.level else 'wholes'} at {granularity:.2f}"
 
     def opened(self, node: int) -> float:
-        """Give the coarsest granularity at which a node that has parts is in its parts."""
+        """Find the coarsest granularity at which a node that has parts comes apart."""
         return next(g for g in self.granularities if np.float32(g) > self.agreement[node])
 
     def closed(self, node: int) -> float:
-        """Give a granularity at which a node is one thing: of an object that of all objects, else the finest."""
+        """Find a granularity at which a node is one thing: that of the objects if it is one, else the finest."""
         if node < self.num_classes:
             return self.level
         return max(g for g in self.granularities if np.float32(g) <= self.agreement[node])
 
     def cut(self, granularity: float) -> np.ndarray:
-        """Tell what stands for each node at a granularity: the largest that holds it and is one there, (M,) int32.
+        """Find which node stands for each at a granularity, (M,) int32: the largest that holds it and is one there.
 
-        Nodes that come apart there stand for themselves; no Gaussian lies in them alone.
-
-        Raises
-        ------
-        SettingsError
-            The granularity is not in [0, 1].
+        Nodes that come apart there stand for themselves; no Gaussian lies in them alone. Raises `SettingsError` where
+        the granularity is not in [0, 1].
         """
         check_granularity(granularity)
         one = (self.parents >= 0) & (self.agreement[self.parents] >= np.float32(granularity))
         return _climbed(np.where(one, self.parents, np.arange(len(self)))).astype(np.int32)
 
     def labels_at(self, granularity: float, labels: np.ndarray) -> np.ndarray:
-        """Node of each Gaussian at a granularity, (N,) int32, for their classes (N,); those of no class stay so.
+        """Node of each Gaussian at a granularity, (N,) int32, by their classes (N,), of which negative ones stay.
 
-        A Gaussian that was given to another class than its leaf's belongs to the largest leaf of that.
+        A Gaussian whose class is no longer that of its leaf belongs to the largest leaf of its class.
         """
         table = self.cut(granularity)
         known = np.maximum(labels, 0)
@@ -169,16 +165,10 @@ class ObjectTree:
         return largest
 
     def shares_at(self, granularity: float, shares: np.ndarray, leaves: np.ndarray) -> tuple[np.ndarray, list[int]]:
-        """Bring class probabilities (n, K) of Gaussians with the leaves (n,) to a granularity.
+        """Turn class probabilities (n, K) of Gaussians with the leaves (n,) into those of the nodes of a level.
 
-        What a Gaussian has of its leaf's class goes to its own part, what it has of others to their largest.
-
-        Returns
-        -------
-        shares : (n, K') float32
-            By node.
-        nodes : list of int
-            The nodes of that level, ascending: first what classes stay.
+        A Gaussian's probability of its leaf's class goes to its own part, that of any other class to its largest part.
+        Returns probabilities (n, K') float32 and the K' nodes of that level, ascending, so that classes come first.
         """
         table = self.cut(granularity)
         tops = table[self._leaf_nodes]
@@ -252,7 +242,7 @@ def check_granularity(granularity: float) -> None:
 
 
 def _climbed(up: np.ndarray) -> np.ndarray:  # (M,)
-    """Follow from each node where `up` leads, to the end; a circle is followed for a while."""
+    """Follow `up` from each node to the end; from a node on a circle, to any other on it."""
     for _ in range(len(up).bit_length()):
         up = up[up]
     return up

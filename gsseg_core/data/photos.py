@@ -11,7 +11,7 @@ from gsseg_core.files.input_files import open_image
 
 
 def read_photo(view: View) -> npt.NDArray[np.uint8] | None:
-    """Read the photo of a view, (H, W, 3) RGB, undistorted; None if there is none of its camera's that can be read."""
+    """Read the photo of a view, (H, W, 3) RGB, undistorted; None if there is none, it is broken or of another size."""
     if view.image_path is None:
         return None
     try:

@@ -23,14 +23,11 @@ from gsseg_core.kernels.compiler import called_by_kernels, kernel
 from gsseg_core.scene.undistortion import Undistortion
 from gsseg_core.text import clipped
 
-STEPS = (16, 8, 4, 2, 1)
-"""Steps from probability 0 to 1: the first of these that gives no more than `MOST_PROTOTYPES`."""
-
-MOST_PROTOTYPES = 512
-"""Prototypes of a view, unless there are more even without any step between 0 and 1."""
+MOST_PROTOTYPES = 512  # of a view, unless there are more even without any step between 0 and 1
+STEPS = (16, 8, 4, 2, 1)  # from probability 0 to 1: the first of these that gives no more than so many prototypes
 
 TOLERANCE = 0.01
-"""Probabilities of a pixel may sum to so much more than 1; half precision and images of 8 bits do."""
+"""By how much probabilities of a pixel may sum to more than 1; those of half precision and images of 8 bits do."""
 
 _SURE = np.float32(1 - 1e-4)
 _TIED = np.float32(0.01)  # of a step, by which equal probabilities may differ
@@ -69,30 +66,24 @@ class SeenLabels(NamedTuple):
 
     def undistorted(self, undistortion: Undistortion) -> SeenLabels:
         """Make the mask of a pinhole view of the one drawn on its image, by nearest pixels; `UNKNOWN` outside it."""
-        return self._of(undistortion.sample(self.labels, UNKNOWN))
+        return self._with_labels(undistortion.sample(self.labels, UNKNOWN))
 
     def every(self, step: int) -> SeenLabels:
         """Keep every step-th pixel of each row and column, from pixel step // 2 on."""
-        return self._of(self.labels[step // 2 :: step, step // 2 :: step])
+        return self._with_labels(self.labels[step // 2 :: step, step // 2 :: step])
 
     def hidden(self, pixels: npt.NDArray[np.bool_]) -> SeenLabels:
         """Make some pixels (H, W) unknown."""
-        return self._of(np.where(pixels, np.int32(UNKNOWN), self.labels))
+        return self._with_labels(np.where(pixels, np.int32(UNKNOWN), self.labels))
 
-    def _of(self, labels: npt.NDArray[np.int32]) -> SeenLabels:
-        """Replace the labels by some of these, among which not every prototype need be left."""
+    def _with_labels(self, labels: npt.NDArray[np.int32]) -> SeenLabels:
+        """Replace the label image by another of the same prototypes, and drop those that no longer occur."""
         if self.evidence is None or self.evidence.mass is None:
             return SeenLabels(labels, self.evidence)
         return _tidied(labels, self.evidence.classes, self.evidence.mass, self.evidence.supervised, None)
 
     def numbered(self, ids: npt.NDArray[np.int32], source: str) -> SeenLabels:
-        """Renumber the classes by their place among some ids, ascending.
-
-        Raises
-        ------
-        UnknownLabelError
-            A class is not among them.
-        """
+        """Renumber the classes by their place among some ids, ascending; `UnknownLabelError` if one is not there."""
         expected = f"ids of the {len(ids)} classes in use"
         table, concerned = self._new_ids(ids, np.arange(len(ids)), source, expected)
         if self.evidence is None:
@@ -102,15 +93,11 @@ class SeenLabels(NamedTuple):
         return SeenLabels(self.labels, LabelEvidence(table[classes], mass, supervised))
 
     def relabelled(self, new_ids: Mapping[int, int], source: str) -> SeenLabels:
-        """Give the classes new ids, and merge those that get the same; pixels of a class that gets `UNKNOWN` are it.
+        """Give the classes new ids, and merge those that get the same; pixels of a class that gets `UNKNOWN` become so.
 
-        Of a soft mask, those are the pixels that name such a class; elsewhere its share is left out of the whole. A
-        class made of several counts as looked for where all of them were; else what is left of 1 is unknown.
-
-        Raises
-        ------
-        UnknownLabelError
-            A class has no new id.
+        In a soft mask, those are the pixels that name such a class; in others its probability is left out, and all else
+        is scaled up for it. A merged class counts as looked for where all its parts were; else what its mask
+        leaves open is unknown. Raises `UnknownLabelError` where a class has no new id.
         """
         table, concerned = self._new_ids([*new_ids], [*new_ids.values()], source, "ids of its classes")
         if self.evidence is None:
@@ -134,13 +121,7 @@ class SeenLabels(NamedTuple):
     def _new_ids(
         self, ids: npt.ArrayLike, new: npt.ArrayLike, source: str, expected: str  # (K,), (K,)
     ) -> tuple[npt.NDArray[np.int32], npt.NDArray[np.int32]]:  # fmt: skip
-        """Give classes new ids: a table of these by id, `UNKNOWN` included, and what `concerned` becomes by it.
-
-        Raises
-        ------
-        UnknownLabelError
-            A class has no new id.
-        """
+        """Give classes new ids: a table of these by id, `UNKNOWN` included, and what `concerned` becomes by it."""
         table = np.full(MAX_LABEL + 2, UNKNOWN - 1, np.int32)  # The last one is for unknown pixels.
         table[np.asarray(ids, np.int64)], table[UNKNOWN] = new, UNKNOWN
         concerned = table[self.concerned]
@@ -162,39 +143,24 @@ class PackedMask:
 
 
 def quantise(
-    probabilities: npt.NDArray[np.floating],  # (C, H, W)
-    classes: Sequence[int] | None = None,
+    probabilities: npt.NDArray[np.floating],  # (C, H, W) of 16, 32 or 64 bits, in [0, 1]; [c] is of class classes[c]
+    classes: Sequence[int] | None = None,  # C ids
     *,
-    unknown: npt.NDArray[np.bool_] | None = None,  # (H, W)
-    source: str = "probabilities",
+    unknown: npt.NDArray[np.bool_] | None = None,  # (H, W): where the segmenter gives no evidence
+    source: str = "probabilities",  # what messages call the mask
 ) -> SeenLabels:
     """Make prototypes of the probabilities that one segmenter gives.
 
-    Each probability is rounded to the nearest step, or, where a pixel's would then sum to more than 1, down. Where
+    With `classes`, the segmenter looked for these and no others: what a pixel's probabilities lack to 1, the rest,
+    means "none of these". Without, [c] is class c, no class is left out, and the rest is unknown.
+
+    Each probability is rounded to the nearest step, or down where a pixel's would then sum to more than 1. Where
     another would come up to the likeliest, that is rounded up and all others down. So none changes by as much as 1/16,
-    or one of the coarser `STEPS` where there would be more than `MOST_PROTOTYPES`. What a pixel's probabilities lack to
-    1 is the rest.
+    or one of the coarser `STEPS` where there would be more than `MOST_PROTOTYPES`.
 
-    Parameters
-    ----------
-    probabilities : (C, H, W) of float16, float32 or float64
-        Of class classes[c] at [c], in [0, 1].
-    classes : sequence of C int, optional
-        The segmenter looked for these classes and no others: the rest means "none of these". Without, [c] is class c,
-        no class is left out, and the rest is unknown.
-    unknown : (H, W) bool, optional
-        Where the segmenter gives no evidence.
-    source : str
-        What messages call the mask.
-
-    Raises
-    ------
-    MaskFormatError
-        The array has another type or dimension, is not finite, has negative values or sums above 1.
-    MaskSizeError
-        `unknown` has another size.
-    UnknownLabelError
-        `classes` are not C different ids from 0 to `MAX_LABEL`.
+    Raises `MaskFormatError` where the array has another type or dimension, is not finite, or has negative values or
+    sums above 1; `MaskSizeError` where `unknown` has another size; `UnknownLabelError` where `classes` are not C
+    different ids from 0 to `MAX_LABEL`.
     """
     given = None if classes is None else np.asarray(classes)
     check_forms(probabilities, given, unknown, source)
@@ -228,7 +194,7 @@ _Form = npt.NDArray[Any] | Header
 
 
 def check_forms(probabilities: _Form, classes: _Form | None, unknown: _Form | None, source: str) -> None:
-    """Raise the errors of `quantise` that types and shapes tell, those of arrays or what headers claim of them."""
+    """Raise the errors of `quantise` that types and shapes tell, of arrays or of their headers in a file."""
     if len(probabilities.shape) != 3 or probabilities.dtype.kind != "f" or not probabilities.shape[0]:
         raise MaskFormatError(
             f"{source}: probabilities are {Header.of(probabilities)}; expected float16 or float32 (K, H, W)"
@@ -255,8 +221,8 @@ def combine_detections(
     prod_c (1 - p_c). For one detector that is p and 1 - p.
 
     A detector gives bool, or float: the probability of its class in each pixel, in [0, 1]. One that ran and found
-    nothing gives zeros; of a class that is not here nothing is known, nor anything where it is `unknown`. Messages call
-    the mask `source`, and errors are those of `quantise`.
+    nothing gives zeros. Of a class without a detector nothing is known, nor of any class where it is `unknown`.
+    Messages call the mask `source`; raises what `quantise` raises.
     """
     if not detections:
         raise MaskFormatError(f"{source}: holds no detections; expected at least one class, zeros where it is not seen")
@@ -281,14 +247,10 @@ def combine_detections(
 
 
 def restrict(labels: npt.NDArray[np.integer], supervised: Collection[int], source: str = "labels") -> SeenLabels:
-    """Give a plain mask the evidence of a segmenter that looked for some classes only; its 0 means "none of these".
+    """Give a plain mask the evidence of a segmenter that looked for some classes only.
 
-    0 is a class as any other if it is among them.
-
-    Raises
-    ------
-    UnknownLabelError
-        The mask holds a class that was not looked for.
+    Its 0 means "none of these", unless 0 is one of them. Raises `UnknownLabelError` where the mask holds a class that
+    was not looked for.
     """
     looked_for = np.array(sorted(set(supervised)), np.int32)
     ids = np.unique(labels)
@@ -308,7 +270,7 @@ def restrict(labels: npt.NDArray[np.integer], supervised: Collection[int], sourc
 
 @kernel
 def _rounded(values: np.ndarray, steps: int) -> np.ndarray:  # (P, C) float32 in [0, 1]
-    """Probabilities of pixels in steps, (P, C) uint8, whose sum is at most `steps`; what is likeliest stays so."""
+    """Round probabilities to whole steps, (P, C) uint8, at most `steps` in all; the likeliest class stays that."""
     count, classes = values.shape
     parts, scaled = np.zeros((count, classes), np.uint8), np.empty(classes, np.float32)
     for p in range(count if classes else 0):
@@ -339,14 +301,14 @@ def _tidied(
     supervised: npt.NDArray[np.int32] | None,
     unknown: npt.NDArray[np.bool_] | None,  # (H, W)
 ) -> SeenLabels:
-    """Drop prototypes without evidence; what is then certain everywhere becomes a plain mask."""
+    """Drop prototypes that do not occur or hold no evidence; a mask that is then certain becomes a plain one."""
     if unknown is not None:
         labels[unknown] = UNKNOWN
-    says = np.bincount(labels[labels >= 0], minlength=len(mass)) > 0
+    kept = np.bincount(labels[labels >= 0], minlength=len(mass)) > 0
     if supervised is None:
-        says &= mass.any(axis=1)
-    mass = mass[says]
-    number = np.append(np.where(says, np.cumsum(says) - 1, UNKNOWN), UNKNOWN).astype(np.int32)
+        kept &= mass.any(axis=1)
+    mass = mass[kept]
+    number = np.append(np.where(kept, np.cumsum(kept) - 1, UNKNOWN), UNKNOWN).astype(np.int32)
     labels = number[labels]
     occurs = mass.any(axis=0)
     classes, mass = classes[occurs], mass[:, occurs]
@@ -366,7 +328,7 @@ def _check_range(values: npt.NDArray[np.generic], what: str) -> None:
 
 @kernel
 def _group(rows: np.ndarray) -> tuple[np.ndarray, np.ndarray]:  # (P, C) uint8
-    """Assign numbers to different rows in order of first occurrence: number of each row (P,), and first row of each."""
+    """Give different rows numbers in order of first occurrence: that of each row (P,), and the first row of each."""
     count, size = rows.shape[0], 64
     while size < 2 * count:
         size *= 2

@@ -174,9 +174,9 @@ class View:
         return replace(view, _mask=PackedMask(seen))
 
     def held(self) -> View:
-        """Keep the mask in memory as its file has it now, whatever becomes of that; raises as `read_labels` does.
+        """Read the mask into memory, so that later changes of its file do not matter; raises as `read_labels` does.
 
-        That is the view itself where the mask is there already, or there is none.
+        Returns the view itself where the mask is in memory already, or there is none.
         """
         if self.is_in_memory or not self.has_mask:
             return self
@@ -185,7 +185,7 @@ class View:
     def smaller(self, step: int) -> View:
         """Make the view of every step-th pixel of each row and column; the view itself where that is all, or none.
 
-        What a pixel sees is a question to the scene and to the mask, so nothing is averaged: see `smaller_camera`.
+        Pixels are left out, never averaged, so that the mask's labels stay exact: see `smaller_camera`.
         """
         if step == 1 or min(self.camera.width, self.camera.height) <= step // 2:
             return self
@@ -292,7 +292,7 @@ class View:
         names: Container[int] = range(MAX_LABEL + 1) if self.class_names is None else self.class_names
         low, high = (int(labels.min()), int(labels.max())) if labels.size else (0, -1)
         if low >= UNKNOWN and high <= MAX_LABEL and all(i in names for i in range(max(low, 0), high + 1)):
-            return  # As usual; to list the labels of an image takes ten times as long.
+            return  # The usual case; to list the labels of an image takes ten times as long.
         unknown = [i for i in np.unique(labels).tolist() if i != UNKNOWN and i not in names]
         if unknown:
             expected = f"0 to {MAX_LABEL}, or {UNKNOWN} for unknown"
@@ -302,12 +302,9 @@ class View:
 
 
 def spread(views: Sequence[T], count: int | None) -> list[T]:
-    """Choose some views, or cameras, spread evenly over all of them; all if there are no more, or `count` is None.
+    """Choose `count` views, or cameras, spread evenly over all of them; all if there are no more, or it is None.
 
-    Raises
-    ------
-    SettingsError
-        None is asked for.
+    Raises `SettingsError` where it is below 1.
     """
     if count is None or count >= len(views):
         return list(views)

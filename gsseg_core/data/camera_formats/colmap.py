@@ -21,8 +21,7 @@ from gsseg_core.text import clipped
 if TYPE_CHECKING:
     import pycolmap
 
-_LEAST_CAMERA = 40
-"""Bytes of a camera in a binary model, of two parameters."""
+_LEAST_CAMERA = 40  # bytes of a camera in a binary model, of one with two parameters
 
 
 def read_colmap(path: Path, within: Path | None) -> list[Camera]:
@@ -62,8 +61,8 @@ def _intrinsics(where: str, camera: pycolmap.Camera) -> Intrinsics:
 def _load(path: Path, within: Path | None) -> pycolmap.Reconstruction:
     """Load the cameras and images of a COLMAP model, without its points.
 
-    The points are not needed and take long to read, and pycolmap does not return from a truncated list of them. Nor
-    does it notice that a binary file ends too early, or a count is impossible, so that is found out here.
+    The points are not needed and take long to read, and pycolmap never returns from a truncated list of them. It does
+    not notice either that a binary file ends too early or that a count is impossible, so both are checked here.
     """
     try:
         import pycolmap

@@ -33,16 +33,14 @@ _COLMAP_TRANSFORM = np.array([[0.0, 1, 0, 0], [1, 0, 0, 0], [0, 0, -1, 0], [0, 0
 def original_to_trained(cameras: Path, path: Path) -> Similarity:
     """Read `dataparser_transforms.json`: from the frame of a COLMAP model to that of nerfstudio's Gaussians.
 
-    Raises
-    ------
-    CameraFileError, PoseError
-        The file is missing or broken, its transform is not rigid, or its scale is not positive.
+    Raises `CameraFileError` or `PoseError` where it is missing or broken, its transform not rigid, or its scale not
+    positive.
     """
     return _similarity(path, *_read(path, "transform", "scale"))
 
 
 def saved_to_trained(transforms: Path, path: Path) -> Similarity:
-    """Read both files: from the frame of `transforms.json` to that of the Gaussians; raises as the former does."""
+    """Read both files: from the frame of `transforms.json` to that of the Gaussians; raises what the other one does."""
     matrix, scale = _read(path, "transform", "scale")
     default = _COLMAP_TRANSFORM if (transforms.parent / "colmap/sparse/0").is_dir() else np.eye(4)
     applied, applied_scale = _read(transforms, "applied_transform", "applied_scale", default)
@@ -52,7 +50,7 @@ def saved_to_trained(transforms: Path, path: Path) -> Similarity:
 
 
 def _similarity(path: Path, matrix: npt.NDArray[np.float64], scale: float) -> Similarity:  # (4, 4)
-    """Make x -> scale * (matrix x), whose scale counts for the translation, too."""
+    """Make the similarity x -> scale * (matrix x), which scales the translation of the matrix, too."""
     left, _, right = np.linalg.svd(matrix[:3, :3])
     rotation = left @ right  # the nearest; files are of single precision
     if np.abs(rotation - matrix[:3, :3]).max() > _RIGID_TOLERANCE or np.linalg.det(rotation) < 0:
@@ -63,7 +61,7 @@ def _similarity(path: Path, matrix: npt.NDArray[np.float64], scale: float) -> Si
 def _read(
     path: Path, transform: str, scale: str, default: npt.NDArray[np.float64] | None = None
 ) -> tuple[npt.NDArray[np.float64], float]:
-    """Read a matrix, (4, 4), and a positive scale; either may be missing where there is a default for the matrix."""
+    """Read a matrix (4, 4) and a positive scale; with a default matrix, either may be missing, the scale being 1."""
     entry = Entry(str(path), read_object(path, CameraFileError, f"an object with '{transform}'"))
     if transform in entry or default is None:
         matrix = np.vstack([entry.array(transform, (3, 4), (4, 4))[:3], (0, 0, 0, 1)])

@@ -21,7 +21,7 @@ from gsseg_core.text import clipped, composed, quoted
 
 @dataclass(frozen=True)
 class Entry:
-    """One camera or image of a file, as a JSON object; `where` it stands begins every message about it."""
+    """One camera or image of a file, as a JSON object; messages about it begin with `where` it stands."""
 
     where: str
     fields: dict[str, Any]
@@ -90,7 +90,7 @@ def cameras_of(
     intrinsics: Intrinsics,
     pose: npt.NDArray[np.float64],  # (4, 4) world to camera
 ) -> list[Camera]:
-    """Make the camera of an image, or, where a lens bent it, those of its pinhole views; errors say where it stands."""
+    """Make the camera of an image or, where a lens bent it, those of its pinhole views; errors begin with `where`."""
     model, size, focal, principal, coefficients = intrinsics
     try:
         if model.projection is Projection.PERSPECTIVE and not any(coefficients.values()):
@@ -115,7 +115,7 @@ def inverse_pose(
 
 
 def stem_of(name: str) -> str:
-    """Name of an image with its folders, `left/0001`, without its suffix; a dot in a name that lacks one is kept."""
+    """Name of an image with its folders, without its suffix if it is one of images: `left/0001` of `left/0001.jpg`."""
     path = PureWindowsPath(composed(name))  # takes both kinds of slash
     stem = path.stem if path.suffix.lower() in IMAGE_SUFFIXES else path.name
     return "/".join([*(part for part in path.parts[:-1] if part not in (path.anchor, "..")), stem])

@@ -20,10 +20,10 @@ from gsseg_core.scene.similarity import Similarity
 class CameraFormat:
     """A format of cameras: the program that writes it, its reader, and the files by which it is recognised.
 
-    A dataset that has one of `files`, in one of its sub-folders `folders` or itself, is of this format. The reader gets
-    the file, or the folder of a format with `folders`, and a folder below which all that is read must lie, or None. It
-    returns the cameras in the order of the file. nerfstudio moves cameras before it trains on them; for formats that it
-    reads, `frame_of_training` tells how, of what `read` got and of the `dataparser_transforms.json` that it wrote.
+    A dataset is of this format if it has one of `files`, in one of its sub-folders `folders` if there are any. `read`
+    takes that file, or with `folders` the sub-folder, and a folder below which all that is read must lie, or None; it
+    returns the cameras in the order of the file. nerfstudio moves cameras before it trains on them: for formats that it
+    reads, `frame_of_training` tells how, from the same file or folder and its `dataparser_transforms.json`.
     """
 
     name: str
@@ -38,7 +38,7 @@ class CameraFormat:
         return next((place for place in places if place is not None), None)
 
     def find_in(self, folder: Path) -> Path | None:
-        """Find what `read` reads in the very folder with the files."""
+        """Find what `read` reads, in the folder that holds `files` itself."""
         for name in self.files:
             if is_there(folder / name, CameraFileError):
                 return folder if self.folders else folder / name

@@ -17,13 +17,12 @@ from gsseg_core.text import quoted
 
 def is_coco(place: Place) -> bool:
     """Recognise COCO: an object with the lists `images` and `annotations`."""
-    content = place.sample[1] if place.sample else None
+    content = place.sample[1]
     return isinstance(content, dict) and all(isinstance(content.get(key), list) for key in ("images", "annotations"))
 
 
 def read_coco(place: Place) -> MaskSet:
     """Read COCO: ids are those of the categories, one more where 0 is an object; the last annotation is on top."""
-    assert place.sample is not None
     path, content = place.sample
     whole = Record.of(content, str(path))
     categories = whole.records("categories", "category")

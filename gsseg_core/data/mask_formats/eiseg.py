@@ -34,7 +34,7 @@ def is_eiseg(place: Place) -> bool:
     """Recognise EISeg: its list of labels, its pictures, or JSON lists of objects with `labelIdx` and `points`."""
     if any(path.name == _LABELS or path.name.lower().endswith(_PICTURES) for path in place.entries):
         return bool(place.by_view(".png") or place.by_view(".json"))
-    content = place.sample[1] if place.sample else None
+    content = place.sample[1]
     first = content[0] if isinstance(content, list) and content else None
     return isinstance(first, dict) and "labelIdx" in first and "points" in first
 
@@ -54,7 +54,7 @@ def read_eiseg(place: Place) -> MaskSet:
 
 
 def _listed(place: Place) -> dict[int, str]:
-    """Names by id of the list of labels, in whose lines an id, a name and a colour stand."""
+    """Read the list of labels, with an id, a name and a colour in each line: names by id."""
     path, names = place.path / _LABELS, {}
     if path.is_file():
         for line in place.text(path).splitlines():

@@ -18,14 +18,10 @@ _MODES = ("1", "L", "P", "I;16")
 
 
 def read_label_image(path: Path, camera: Camera, within: Path | None = None) -> npt.NDArray[np.int32]:
-    """Read a label image (H, W) in the size of the image that a camera took, which is checked before any pixel is read.
+    """Read a label image (H, W), scaled to the size of the image that a camera took.
 
-    Raises
-    ------
-    MaskFormatError, MaskSizeError
-        It is missing, broken, or another kind of image, or has another shape than the camera's.
-    PathNotAllowedError
-        It lies outside `within`.
+    Before any pixel is read, raises `MaskFormatError` where it is missing, broken or another kind of image,
+    `MaskSizeError` where it has another shape than the camera's, `PathNotAllowedError` where it lies outside `within`.
     """
     header = mask_header(path, within)
     check_fit(header.width, header.height, camera, str(path))

@@ -5,8 +5,6 @@ Objects of a higher layer are on top, and of those of one layer the last.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-
 from gsseg_core.data.mask_formats.masks import MaskSet
 from gsseg_core.data.mask_formats.named import NamedDrawing, NamedShape, read_named
 from gsseg_core.data.mask_formats.place import Place
@@ -16,10 +14,9 @@ from gsseg_core.data.mask_formats.shapes import Polygons
 
 def is_isat(place: Place) -> bool:
     """Recognise ISAT: an object with the object `info` and the list `objects`."""
-    content = place.sample[1] if place.sample else None
-    if not isinstance(content, dict):
-        return False
-    return isinstance(content.get("info"), dict) and isinstance(content.get("objects"), list)
+    content = place.sample[1]
+    info, objects = (content.get("info"), content.get("objects")) if isinstance(content, dict) else (None, None)
+    return isinstance(info, dict) and isinstance(objects, list)
 
 
 def read_isat(place: Place) -> MaskSet:
@@ -28,10 +25,9 @@ def read_isat(place: Place) -> MaskSet:
 
 
 def _parse(whole: Record) -> NamedDrawing:
-    return NamedDrawing(whole.record("info").size("width", "height"), _shapes(whole))
+    return NamedDrawing(whole.record("info").size("width", "height"), map(_shape, whole.records("objects", "object")))
 
 
-def _shapes(whole: Record) -> Iterator[NamedShape]:
-    for entry in whole.records("objects", "object"):
-        region = Polygons.of(entry.value("segmentation"), entry.where)
-        yield NamedShape(entry.class_name("category"), region, entry.number("layer", 0.0))
+def _shape(entry: Record) -> NamedShape:
+    region = Polygons.of(entry.value("segmentation"), entry.where)
+    return NamedShape(entry.class_name("category"), region, entry.number("layer", 0.0))

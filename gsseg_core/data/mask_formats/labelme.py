@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import base64
 import io
-from collections.abc import Iterator
 
 import numpy as np
 import numpy.typing as npt
@@ -22,16 +21,16 @@ from gsseg_core.errors import MaskFormatError
 from gsseg_core.files.input_files import decode_image
 from gsseg_core.text import quoted
 
-_CORNERS = 90
+_CORNERS = 90  # of the polygon that stands for a circle
 _KINDS = ("rectangle", "circle", "mask")
 
 
 def is_labelme(place: Place) -> bool:
     """Recognise LabelMe: an object with the list `shapes`, and `imagePath` or `imageHeight`."""
-    content = place.sample[1] if place.sample else None
-    if not isinstance(content, dict):
+    content = place.sample[1]
+    if not isinstance(content, dict) or not isinstance(content.get("shapes"), list):
         return False
-    return isinstance(content.get("shapes"), list) and not content.keys().isdisjoint(("imagePath", "imageHeight"))
+    return "imagePath" in content or "imageHeight" in content
 
 
 def read_labelme(place: Place) -> MaskSet:
@@ -40,12 +39,8 @@ def read_labelme(place: Place) -> MaskSet:
 
 
 def _parse(whole: Record) -> NamedDrawing:
-    return NamedDrawing(whole.size("imageWidth", "imageHeight"), _shapes(whole))
-
-
-def _shapes(whole: Record) -> Iterator[NamedShape]:
-    for shape in whole.records("shapes", "shape"):
-        yield NamedShape(shape.class_name("label"), _region(shape))
+    size = whole.size("imageWidth", "imageHeight")
+    return NamedDrawing(size, (NamedShape(s.class_name("label"), _region(s)) for s in whole.records("shapes", "shape")))
 
 
 def _region(shape: Record) -> Region:

@@ -43,37 +43,29 @@ class ViewMask:
     def labels(self, camera: Camera) -> npt.NDArray[np.int32]:
         """Read labels (H, W) of the size of the image as it was taken, scaled if the mask has another one.
 
-        Raises
-        ------
-        MaskFormatError, MaskSizeError
-            The mask is missing, broken, or of another shape than the camera's image.
+        Raises `MaskFormatError` where the mask is missing or broken, `MaskSizeError` where it has another shape than
+        the camera's image.
         """
         try:
             return self.read(camera)
-        except RecursionError as cause:  # As deep as JSON may be nested, a message that quotes it may not be.
+        except RecursionError as cause:  # Quoting what is nested goes less deep than reading it.
             raise MaskFormatError(f"{self.where}: is nested too deep; expected a mask") from cause
 
 
 @dataclass(frozen=True, eq=False)
 class MaskSet:
-    """Masks by view. `class_names` are those of their ids, None where they have none; `format` is what they were.
-
-    With `per_view`, an id is something inside its own view only, and has no name.
-    """
+    """The masks of all views that another program wrote."""
 
     views: Mapping[str, ViewMask]
-    class_names: Mapping[int, str] | None = None
-    per_view: bool = False
-    format: str = ""
+    class_names: Mapping[int, str] | None = None  # by id; None where ids have no names
+    per_view: bool = False  # whether an id means something in its own view only
+    format: str = ""  # name in `MASK_FORMATS`
 
 
 def number_names(names: Iterable[str], where: str) -> dict[str, int]:
-    """Assign ids to names of classes, from 1; the background is 0, and `__ignore__`, as LabelMe has it, unknown.
+    """Assign ids to names of classes, from 1; the background is 0, and LabelMe's `__ignore__` unknown.
 
-    Raises
-    ------
-    MaskFormatError
-        There are more than labels.
+    Raises `MaskFormatError` where there are more names than labels.
     """
     numbers = {**dict.fromkeys(_BACKGROUND, 0), _IGNORED: UNKNOWN}
     for name in names:
@@ -84,13 +76,13 @@ def number_names(names: Iterable[str], where: str) -> dict[str, int]:
 
 
 def names_of(numbers: Mapping[str, int]) -> dict[int, str]:
-    """Names by id, the background as gsseg calls it, of names with their ids."""
+    """Turn ids by name into names by id; the background has gsseg's name."""
     found = {number: name for name, number in numbers.items() if number > 0}
     return {0: BACKGROUND_NAME, **dict(sorted(found.items()))}
 
 
 def ids_from_zero(names: Mapping[int, str]) -> dict[int, int]:
-    """Labels for ids of a format in which 0 may be an object: one more than the id if it is, the id itself if not."""
+    """Labels by id for a format in which 0 may be an object: one more than the id if it is, else the id itself."""
     shift = 1 if 0 in names and names[0].lower() not in _BACKGROUND else 0
     return {i: i + shift for i in names}
 
@@ -103,7 +95,7 @@ def check_name(name: object, where: str) -> str:
 
 
 def check_id(value: object, where: str) -> int:
-    """Return an id, or raise `MaskFormatError` if it is no label."""
+    """Return an id, or raise `MaskFormatError` if it can be no label."""
     if type(value) is not int or not 0 <= value < MAX_LABEL:
         raise MaskFormatError(f"{where}: has the id {quoted(value)}; expected whole numbers from 0 to {MAX_LABEL - 1}")
     return value

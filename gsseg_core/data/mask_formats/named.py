@@ -42,7 +42,7 @@ Parser = Callable[[Record], NamedDrawing]
 
 
 def read_named(place: Place, parse: Parser) -> MaskSet:
-    """Read the files of all views with a parser of their JSON; raises what it raises."""
+    """Read the files of all views with a parser of their JSON; raises what that raises."""
     files = place.by_view(".json")
     names: set[str] = set()
     sizes = {}

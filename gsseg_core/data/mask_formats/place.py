@@ -31,7 +31,7 @@ def view_of(name: str, stems: Collection[str]) -> str | None:
     `frame_1.png`, `frame_1.jpg.png`, `frame_1_mask.png`, `images/frame_1.jpg` and the like all belong to `frame_1`,
     and `left/1.png` to `left_1`, unless there is a view that is closer to the name.
     """
-    candidates = with_folders(name)
+    candidates = possible_stems(name)
     for _ in range(4):
         tried = list(dict.fromkeys(s for c in candidates for s in (c, _MARK.sub("", c), _RENAMED.sub("", c))))
         for stem in tried:
@@ -42,24 +42,24 @@ def view_of(name: str, stems: Collection[str]) -> str | None:
     return None
 
 
-def with_folders(name: str) -> list[str]:
-    """List what a file may be called: its name, alone and after those of folders above it, as `read_cameras` does."""
+def possible_stems(name: str) -> list[str]:
+    """List the names that `read_cameras` may give a file: its own, alone and after those of the folders above it."""
     parts = PureWindowsPath(composed(name[-1000:])).parts  # takes both kinds of slash
     return ["_".join(parts[-count:]) for count in range(1, min(len(parts), 1 + _FOLDERS) + 1)]
 
 
 @dataclass(frozen=True, eq=False)
 class Place:
-    """What `--labels` names, with what formats ask of it; it and all below must lie in `within`, if that is given."""
+    """The file or folder that `--labels` names; it and all below must lie in `within`, if that is given."""
 
     path: Path
     stems: frozenset[str]
     within: Path | None = None
-    strangers: list[str] = field(default_factory=list)  # names that are of no view, for messages
+    unmatched: list[str] = field(default_factory=list)  # names that belong to no view, for messages
 
     @cached_property
     def entries(self) -> list[Path]:
-        """Files and folders in it, sorted, but for gsseg's own `supervises.json`; none if it is a file."""
+        """Files and folders in it, sorted, without gsseg's own `supervises.json`; none if it is a file."""
         return [path for path in list_folder(self.path, self.within) if path.name != SUPERVISES]
 
     @property
@@ -68,21 +68,17 @@ class Place:
         return [path for path in self.entries if path.is_dir() and not path.name.startswith(".")]
 
     def view_of(self, name: str) -> str | None:
-        """Find the view that a name belongs to, by the function of this name."""
+        """Find the view that a name belongs to by the function `view_of`, and keep names that belong to none."""
         view = view_of(name, self.stems)
         if view is None:
-            self.strangers.append(name)
+            self.unmatched.append(name)
         return view
 
     def by_view(self, suffix: str) -> dict[str, Path]:
         """Find the files with a suffix that belong to a view, by view: those in a folder, or the file itself.
 
-        A file that is named itself, where there is one view only, belongs to it whatever it is called.
-
-        Raises
-        ------
-        MaskFormatError
-            A view has two.
+        If the place is a file and there is one view only, it belongs to that view, whatever its name. Raises
+        `MaskFormatError` where a view has two.
         """
         files = [path for path in self.entries or [self.path] if path.suffix.lower() == suffix and not path.is_dir()]
         if len(self.stems) == 1 and files == [self.path]:
@@ -103,21 +99,21 @@ class Place:
         return found
 
     @cached_property
-    def sample(self) -> tuple[Path, object] | None:
-        """The JSON file by which formats are told apart, with what it holds: the first of a view, or the only one.
+    def sample(self) -> tuple[Path, object]:
+        """The JSON file by which formats are told apart, with what it holds, None where there is none.
 
-        An empty list tells nothing: whoever writes one found nothing in that image.
+        It is the first of a view, or the only one. An empty list is passed over: it says that nothing was found in an
+        image, and nothing of the format.
         """
-        paths = list(self.by_view(".json").values()) or [path for path in (self.only(".json"),) if path]
-        found = None
-        for path in paths:
-            found = path, read_json(path, MaskFormatError, self.within)
-            if found[1] != []:
+        path, content = self.path, None
+        for path in self.by_view(".json").values() or filter(None, [self.only(".json")]):
+            content = read_json(path, MaskFormatError, self.within)
+            if content != []:
                 break
-        return found
+        return path, content
 
     def only(self, suffix: str) -> Path | None:
-        """Find the only file with a suffix, which the place itself may be; none beside masks of single views."""
+        """Find the only file with a suffix, the place itself perhaps; None where single views have masks beside it."""
         files = [path for path in self.entries or [self.path] if path.suffix.lower() == suffix and path.is_file()]
         return files[0] if len(files) == 1 and not self._has_views else None
 

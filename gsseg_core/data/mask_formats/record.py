@@ -15,7 +15,7 @@ from gsseg_core.text import clipped
 
 @dataclass(frozen=True)
 class Record:
-    """A JSON object of a mask file; `where` it stands begins every message about it."""
+    """A JSON object of a mask file; messages about it begin with `where` it stands."""
 
     where: str
     fields: Mapping[str, Any]

@@ -1,4 +1,4 @@
-"""Run-length encoding of COCO: how long the runs of a mask are, column by column, the first of pixels outside."""
+"""Run-length encoding of COCO: lengths of runs down the columns, by turns outside and inside of the mask."""
 
 from __future__ import annotations
 
@@ -9,20 +9,15 @@ from gsseg_core.errors import MaskFormatError
 from gsseg_core.files.json_files import kind_of
 from gsseg_core.text import clipped
 
-_MOST_CHARACTERS = 7
-"""Characters of one number, of five bits each: more than any image has pixels."""
+_MOST_CHARACTERS = 7  # of one number, five bits each: that is more than any image has pixels
 
 
 def run_lengths(counts: object, where: str) -> npt.NDArray[np.int64]:
     """Read `counts` as COCO files have them, as a list of lengths or as text, into lengths (R,).
 
     In text, a character holds five bits of a number in two's complement, the lowest first, and whether more follow;
-    from the fourth number on, the difference to the last but one is written (`maskApi.c` of the COCO API).
-
-    Raises
-    ------
-    MaskFormatError
-        It is neither, or a length is negative.
+    from the fourth number on, the difference to the last but one is written (`maskApi.c` of the COCO API). Raises
+    `MaskFormatError` where it is neither, or a length is negative.
     """
     if isinstance(counts, str):
         lengths = _decoded(counts, where)
@@ -45,12 +40,9 @@ def runs_to_mask(
 ) -> npt.NDArray[np.bool_]:
     """Turn lengths of runs into a mask (H, W) bool; `order` is "F" where they go down the columns, "C" along rows.
 
-    Raises
-    ------
-    MaskFormatError
-        They do not sum to the pixels of the mask; no memory was taken for them.
+    Raises `MaskFormatError`, before memory is taken, where they do not sum to the pixels of the mask.
     """
-    total = float(lengths.sum(dtype=np.float64))  # Of large numbers, an integer would be wrong and look right.
+    total = float(lengths.sum(dtype=np.float64))  # Integers may overflow to a sum that looks right.
     if total != width * height:
         raise MaskFormatError(
             f"{where}: its runs are {clipped(f'{total:.0f}', 24)} pixels long; expected {width * height:,}, "

@@ -31,15 +31,12 @@ _MARKS = ("predicted_iou", "stability_score")
 
 def is_sam_json(place: Place) -> bool:
     """Recognise masks in JSON: objects with RLE in `segmentation`, and `predicted_iou` or `stability_score`."""
-    if place.sample is None:
-        return False
     first = next(iter(_listed(place.sample[1])), None)
     return isinstance(first, dict) and "segmentation" in first and any(mark in first for mark in _MARKS)
 
 
 def read_sam_json(place: Place) -> MaskSet:
     """Read masks in JSON, a file per image: a list, or an object with the list `annotations`, as SA-1B has it."""
-    assert place.sample is not None
     files, size = place.by_view(".json"), _drawing(*place.sample)[:2]
     return MaskSet(
         {view: ViewMask(str(path), partial(_read_json, place, path), size) for view, path in files.items()},
@@ -66,7 +63,7 @@ def _read_json(place: Place, path: Path, camera: Camera) -> npt.NDArray[np.int32
 
 
 def _listed(content: object) -> list[object]:
-    """Return the masks in a JSON file; none if it is another kind of file."""
+    """Return the masks in a JSON file; none of another kind of file."""
     if isinstance(content, dict) and "image" in content:
         content = content.get("annotations")
     return content if isinstance(content, list) else []

@@ -26,8 +26,8 @@ from gsseg_core.text import clipped
 T = TypeVar("T", bound=np.generic)
 
 _AT_ONCE = 2**18  # crossings of rows and edges that are worked on at a time
-_FEW = 2**16  # crossings that a polygon may have in any image
-_RING_PIXELS = 2**16  # that are filled in the time that a polygon takes by itself, however small
+_FEW = 2**16  # crossings that a polygon may have in an image of any size
+_RING_PIXELS = 2**16  # pixels that are filled in the time that any polygon takes by itself, however small
 
 
 class Part(NamedTuple):
@@ -47,7 +47,7 @@ class Region(Protocol):
 
 @dataclass(frozen=True, eq=False)
 class Polygons:
-    """Polygons, each with the pixels inside of it by the even-odd rule; their `where` begins messages."""
+    """Polygons, each with the pixels inside of it by the even-odd rule; messages begin with `where` they stand."""
 
     rings: list[npt.NDArray[np.float64]]  # each (P, 2): x, y
     where: str
@@ -56,10 +56,7 @@ class Polygons:
     def of(cls, value: object, where: str) -> Polygons:
         """Read one polygon as JSON has it: [[x, y], ...] or [x, y, x, y, ...].
 
-        Raises
-        ------
-        MaskFormatError
-            It is none, or has NaN or coordinates that no image has.
+        Raises `MaskFormatError` where it is none, or has NaN or coordinates that no image has.
         """
         try:
             points = np.array(value, np.float64)
@@ -92,14 +89,15 @@ class Polygons:
         (left, top), (right, bottom) = edges.low.min(axis=1).tolist(), edges.high.max(axis=1).tolist()
         if right <= left or bottom <= top:
             return
-        fits = np.min_scalar_type(-2 * len(count))
-        depth = np.zeros((bottom - top) * (right - left) + 1, fits)  # polygons that a pixel is in, first the changes
+        dtype = np.min_scalar_type(-2 * len(count))
+        # How many polygons each pixel is in; before the sum, how many begin less how many end there.
+        depth = np.zeros((bottom - top) * (right - left) + 1, dtype)
         for ring, row, column in edges.crossings():
             row, column = np.divmod(np.sort((ring * height + row) * (width + 1) + column), width + 1)
             pixel = (row % height - top) * (right - left) + column - left
-            np.add.at(depth, pixel[::2], fits.type(1))
-            np.subtract.at(depth, pixel[1::2], fits.type(1))
-        np.cumsum(depth, dtype=fits, out=depth)
+            np.add.at(depth, pixel[::2], dtype.type(1))
+            np.subtract.at(depth, pixel[1::2], dtype.type(1))
+        np.cumsum(depth, dtype=dtype, out=depth)
         yield Part(top, left, depth[:-1].reshape(bottom - top, right - left) > 0)
 
 
@@ -200,12 +198,8 @@ class Drawing(NamedTuple):
     def labels(self, camera: Camera, where: str) -> npt.NDArray[np.int32]:
         """Paint the labels (H, W) of the image that a camera took, 0 where there is no shape; scaled if need be.
 
-        Raises
-        ------
-        MaskFormatError
-            A shape is broken, or there are more than labels.
-        MaskSizeError
-            The image has another shape than the camera's.
+        Raises `MaskFormatError` where a shape is broken, or there are more shapes than labels, and `MaskSizeError`
+        where the image has another shape than the camera's.
         """
         if len(self.shapes) > MAX_LABEL:
             raise MaskFormatError(f"{where}: has {len(self.shapes):,} shapes; expected at most {MAX_LABEL:,} in a view")

@@ -1,6 +1,6 @@
 """The table of mask formats of other programs: how each is recognised, and who reads it.
 
-gsseg's own masks, a label image, probabilities or detections per view, are no line of it: `data/mask_files.py`.
+gsseg's own masks, a label image, probabilities or detections per view, are not in it: see `data/mask_files.py`.
 """
 
 from __future__ import annotations
@@ -91,14 +91,8 @@ MASK_FORMATS = [
 def open_masks(path: Path, stems: Iterable[str], within: Path | None = None) -> MaskSet | None:
     """Open the masks of another program, recognised by what they hold; None for gsseg's own, or where there are none.
 
-    Raises
-    ------
-    MaskFormatError
-        It is a file of no known format, may be of several, is broken, or has no mask of a view.
-    PathNotAllowedError
-        It lies outside `within`.
-    SettingsError
-        A library that it needs is not installed.
+    Raises `MaskFormatError` where they are of no known format, or may be of several, are broken, or of no view;
+    `PathNotAllowedError` where they lie outside `within`; `SettingsError` where a library is needed and not installed.
     """
     if not path.exists():
         return None
@@ -120,7 +114,7 @@ def open_masks(path: Path, stems: Iterable[str], within: Path | None = None) -> 
         raise MaskFormatError(f"{path}: is nested too deep; expected masks") from cause
     if masks is not None and not masks.views:
         names_of_views = ", ".join(map(quoted, sorted(place.stems)[:3]))
-        others = f" but of {quoted(place.strangers[-1])}" if place.strangers else ""
+        others = f" but of {quoted(place.unmatched[-1])}" if place.unmatched else ""
         raise MaskFormatError(
             f"{path}: has masks of no view{others}; expected names of views, such as {names_of_views}"
         )
