@@ -113,7 +113,7 @@ class Camera:
         return taken_by.width, taken_by.height
 
     def check_image(self, image: npt.NDArray[Any], found: str, channels: bool = False) -> None:
-        """Raise `MaskSizeError` unless an image is (H, W) of this view, or (H, W, K); `found` begins "labels have"."""
+        """Raise `MaskSizeError` unless an image is (H, W) of this view, or (H, W, K); `found` is like "labels have"."""
         if image.ndim != 2 + channels or image.shape[:2] != (self.height, self.width):
             expected = f"({self.height}, {self.width}{', K' * channels})"
             raise MaskSizeError(f"view '{self.name}': {found} shape {image.shape}; expected {expected}")
@@ -167,7 +167,7 @@ class Camera:
 
 
 def rigid_motion(rotation: npt.ArrayLike, translation: npt.ArrayLike) -> npt.NDArray[np.float64]:  # (3, 3), (3,)
-    """Put a rotation and a translation together, (4, 4)."""
+    """Make the matrix (4, 4) of a rotation and a translation."""
     motion = np.eye(4)
     motion[:3, :3], motion[:3, 3] = rotation, translation
     return motion
@@ -199,7 +199,7 @@ def undistorted_camera(
 def smaller_camera(camera: Camera, step: int) -> Camera:
     """Make the camera whose pixels are every step-th of each row and column, from pixel step // 2 on.
 
-    Its pixels' centres are those of the pixels that are kept, so that masks and photos drawn on the image fit.
+    Its pixels have the centres of those that are kept, so that masks and photos of the image fit.
     """
     width, height = (max(-((step // 2 - side) // step), 1) for side in (camera.width, camera.height))
     whole = camera.undistortion or Undistortion(
@@ -215,6 +215,6 @@ def smaller_camera(camera: Camera, step: int) -> Camera:
 
 
 def resized_camera(camera: Camera, width: int, height: int) -> Camera:
-    """Make the camera that shows the same in so many pixels; they are not those of any mask."""
+    """Make the camera that shows the same in another number of pixels, for which there is no mask."""
     scale = np.diag([width / camera.width, height / camera.height, 1])
     return replace(camera, width=width, height=height, K=scale @ camera.K, undistortion=None)

@@ -75,7 +75,7 @@ def _find(content: object) -> tuple[Mapping[str, Any], dict[str, str]]:
 
 
 def _array(tensors: Mapping[str, Any], name: str, most: int) -> npt.NDArray[np.float32]:
-    """Take a tensor as an array, unless it repeats what is in the file to become larger than that."""
+    """Take a tensor as an array; `UnfitError` where strides make it larger than the file, of `most` bytes."""
     import torch
 
     tensor = tensors.get(name)

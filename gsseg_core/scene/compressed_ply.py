@@ -68,7 +68,7 @@ def _pack(
 
 
 def _fraction(bits: npt.NDArray[np.uint32], shift: int, count: int) -> npt.NDArray[np.float32]:
-    """Take `count` bits of each number as a fraction of the largest that they can say."""
+    """Read `count` bits of each number as a fraction of the largest number that they hold."""
     most = (1 << count) - 1
     return ((bits >> np.uint32(shift)) & np.uint32(most)).astype(np.float32) / np.float32(most)
 

@@ -37,9 +37,9 @@ from gsseg_core.scene.vertices import (
 
 ACTIVATED = ("means", "quats", "scales", "opacities")  # arrays of a scene, a row for each Gaussian
 
+_FLOAT32_MAX = float(np.finfo(np.float32).max)
 # Logits and log scales beyond these change nothing that can be seen, but the activated values would leave (0, 1), or
 # their squares the range of float32.
-_ANY = float(np.finfo(np.float32).max)
 _MAX_LOGIT = 16.0
 _MAX_LOG_SCALE = 40.0
 _AT_ONCE = 1 << 18  # numbers that fit into the cache of a processor
@@ -154,10 +154,12 @@ class GaussianScene:
         sh_names = _sh_names(vertices, source)
         if len(vertices) == 0:
             raise EmptySceneError(f"{source}: holds no Gaussian (0 vertices); expected at least one")
-        if not _all_within(vertices, min(_ANY, LIMITS.max_value)):
-            asked = [(OPACITY, "opacities", _ANY), (SCALES, "scales", _ANY), (QUATS, "rotations", _ANY)]
-            asked += [(MEANS, "positions", LIMITS.max_value), (sh_names, "SH coefficients", LIMITS.max_value)]
-            for names, what, most in asked:
+        if not _all_within(vertices, min(_FLOAT32_MAX, LIMITS.max_value)):
+            for names, what, most in (
+                (OPACITY, "opacities", _FLOAT32_MAX), (SCALES, "scales", _FLOAT32_MAX),
+                (QUATS, "rotations", _FLOAT32_MAX), (MEANS, "positions", LIMITS.max_value),
+                (sh_names, "SH coefficients", LIMITS.max_value),
+            ):  # fmt: skip
                 _check_finite(columns(vertices, names), what, source, most)
         means, quats, scales, opacities = _activated(vertices)
         zero = np.flatnonzero(np.isnan(quats[:, 0]))

@@ -71,7 +71,7 @@ def _chunks(content: bytes) -> tuple[bytes, bytes | None]:
 
 
 class _Reader:
-    """Splats out of one document; whatever in it is missing or of another type is an error of Python's own."""
+    """Reader of the splats of one document; what is missing there or of another type is an error of Python's own."""
 
     def __init__(self, document: Any, binary: bytes | None, path: Path, within: Path | None) -> None:
         self._document, self._binary, self._path, self._within = document, binary, path, within
@@ -96,7 +96,7 @@ class _Reader:
         return ReadScene(np.concatenate(parts), "2.0", ("SPZ inside",) if _SPZ in used else ())
 
     def _meshes(self) -> Iterator[tuple[int, npt.NDArray[np.float64]]]:
-        """Meshes of the scene with what their nodes make of them, (4, 4): depth first, in the order of the file."""
+        """Meshes of the scene, depth first, in the order of the file, with the matrices (4, 4) that place them."""
         scenes, nodes = self._document["scenes"], self._document["nodes"]
         waiting = [(node, np.eye(4)) for node in reversed(scenes[self._document.get("scene", 0)].get("nodes", ()))]
         left = len(nodes)

@@ -1,7 +1,7 @@
 """Frames of groups of Gaussians: how one lies in another, and Gaussians moved from one to the other.
 
-All is computed number by number, without products of matrices: what comes out for a Gaussian is the same bits whichever
-others are moved with it.
+Positions and shapes are computed without products of matrices, so they come out the same, bit for bit, whichever other
+Gaussians are moved along.
 """
 
 from __future__ import annotations

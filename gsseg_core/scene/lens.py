@@ -21,12 +21,12 @@ _PROFILE_STEPS = 4096
 _WIDEST_PERSPECTIVE = math.radians(89)
 _NEWTON_STEPS = 12
 _DIFFERENCE = 1e-6
-_CHECKED = 17  # columns, and rows, of pixels whose rays are found to see whether a lens can be undone
+_CHECKED = 17  # radii, and directions, of the pixels at which it is checked that a lens can be undone
 _TOLERANCE_PX = 1e-3
 
 
 class Projection(Enum):
-    """How far from the principal point a ray lands at an angle a to the optical axis, in focal lengths, undistorted."""
+    """Distance from the principal point, in focal lengths, of a ray at angle a to the optical axis, undistorted."""
 
     PERSPECTIVE = "tan a"
     FISHEYE = "a"
@@ -49,7 +49,7 @@ class LensModel:
     def order(self, coefficients: Mapping[str, float]) -> tuple[float, ...]:
         """Put coefficients by name into the model's order; those that are not there are 0.
 
-        Raises `IntrinsicsError` where one that is not 0 is none of this model.
+        Raises `IntrinsicsError` where one that is not 0 does not belong to this model.
         """
         for name, value in coefficients.items():
             if value and name not in self.coefficients:
@@ -126,7 +126,7 @@ class Lens:
         across = np.hypot(x, y)
         angle = np.arctan2(across, z)
         with np.errstate(all="ignore"):
-            scale = np.where(across > 0, self._spread(angle) / across, 1 / z)
+            scale = np.where(across > 0, self._radius(angle) / across, 1 / z)
             landed = self._distorted(rays[..., :2] * scale[..., None])
         return np.where((angle <= self.reach)[..., None], landed * self.focal + self.principal, np.nan)
 
@@ -149,7 +149,8 @@ class Lens:
     def _named(self) -> dict[str, float]:
         return dict(zip(self.model.coefficients, self.coefficients, strict=False))
 
-    def _spread(self, angle: Floats) -> Floats:
+    def _radius(self, angle: Floats) -> Floats:
+        """Distance from the principal point at which rays land undistorted, in focal lengths."""
         return angle if self.model.projection is Projection.FISHEYE else np.tan(angle)
 
     def _radial(self, squared: Floats) -> Floats:
@@ -168,7 +169,7 @@ class Lens:
     def _undistorted(self, wanted: Floats) -> Floats:  # (..., 2)
         angles, radii = _profile(self)
         out = np.hypot(wanted[..., 0], wanted[..., 1])
-        start = self._spread(np.interp(out, radii, angles))
+        start = self._radius(np.interp(out, radii, angles))
         place = wanted * np.where(out > 0, start / out, 1.0)[..., None]
         for _ in range(_NEWTON_STEPS):
             here = self._distorted(place)
@@ -203,11 +204,11 @@ class Lens:
 
 @lru_cache(maxsize=64)
 def _profile(lens: Lens) -> tuple[Floats, Floats]:
-    """Angles from 0 to the reach of a lens, and how far out, in focal lengths, rays land at these but for tilts."""
+    """Angles from 0 to the reach of a lens, and the radii, in focal lengths, at which radial distortion puts them."""
     widest = math.pi if lens.model.projection is Projection.FISHEYE else _WIDEST_PERSPECTIVE
     angles = np.linspace(0, widest, _PROFILE_STEPS)
     with np.errstate(all="ignore"):
-        radii = lens._spread(angles) * lens._radial(lens._spread(angles) ** 2)
+        radii = lens._radius(angles) * lens._radial(lens._radius(angles) ** 2)
         shrinks = np.flatnonzero(~(np.diff(radii) > 0))
     count = int(shrinks[0]) + 1 if len(shrinks) else _PROFILE_STEPS
     return angles[:count], radii[:count]

@@ -1,4 +1,4 @@
-"""A scene that changes, in the npz of a saved state: ids, groups and their frames, and geometry without colours."""
+"""A `LivingScene` in the npz of a saved state: ids, groups and their frames, and geometry without colours."""
 
 from __future__ import annotations
 
@@ -48,7 +48,7 @@ def read(file: NpzArrays, header: dict[str, Any]) -> LivingScene | None:
 
 
 def without_colours(living: LivingScene) -> LivingScene:
-    """Keep of a scene what its votes depend on, bit for bit, in a fifth of the memory."""
+    """Drop the colours of a scene: its votes stay the same, bit for bit, and it takes a fifth of the memory."""
     local = _colourless(columns(living.local.vertices, _GEOMETRY))
     return LivingScene.placed(local, living.ids, living.groups, living.frames)
 

@@ -1,8 +1,8 @@
 """A scene that changes while it is in use: Gaussians with ids that stay, in groups that move as one.
 
-Every Gaussian is kept as it was given, in the frame of its group, and is never changed; what a move changes is the
-frame. So Gaussians that moved a thousand times are moved but once from where they were given, and what one group's
-views see of that group alone stays the same bit for bit, wherever the group goes. docs/living_map.md has the whole.
+Every Gaussian is kept as it was given, in the frame of its group; a move changes the frame alone. So rounding does not
+add up over a thousand moves, and what one group's views see of that group alone stays the same bit for bit, wherever
+the group goes. See docs/living_map.md.
 """
 
 from __future__ import annotations
@@ -65,14 +65,14 @@ class LivingScene:
         cls, local: GaussianScene, ids: npt.NDArray[np.int64], groups: npt.NDArray[np.int64],
         frames: Mapping[int, Similarity],
     ) -> LivingScene:  # fmt: skip
-        """Put N Gaussians that are in the frames of their groups where these have them."""
+        """Make a scene of N Gaussians, given in the frames of their groups."""
         far = np.isin(groups, [group for group, frame in frames.items() if not is_identity(frame)])
         scene = cls._placed(local, local, groups, frames, far) if far.any() else local
         return cls(scene, local, ids, groups, frames)
 
     @classmethod
     def numbered(cls, scene: GaussianScene, ids: npt.NDArray[np.int64]) -> LivingScene:  # (N,)
-        """Begin with a scene, as `of`, with ids of its own choice."""
+        """Begin with a scene, as `of`, with these ids."""
         return cls.of(replace(scene, vertices=with_ids(scene.vertices, None, ids)))
 
     def flat(self) -> LivingScene:
@@ -196,7 +196,7 @@ class LivingScene:
         scene: GaussianScene, local: GaussianScene, groups: npt.NDArray[np.int64],
         frames: Mapping[int, Similarity], changed: npt.NDArray[np.bool_],  # (N,)
     ) -> GaussianScene:  # fmt: skip
-        """Put the Gaussians that changed where the frames of their groups have them; the rest stay as they are."""
+        """Move the Gaussians that changed to where the frames of their groups put them; the rest stay as they are."""
         arrays: dict[str, Any] = {name: getattr(scene, name).copy() for name in (*ACTIVATED, "vertices")}
         for group in np.unique(groups[changed]).tolist():
             here = changed & (groups == group)

@@ -57,7 +57,7 @@ def _native(data: npt.NDArray[np.void]) -> npt.NDArray[np.void]:
 
 
 def _copied(data: npt.NDArray[np.uint8]) -> npt.NDArray[np.uint8]:  # (B,)
-    """Copy bytes, for NumPy copies records field after field; in two threads, since it is pages that take the time."""
+    """Copy bytes, as NumPy would copy records field after field; in two threads, since page faults take the time."""
     copy = np.empty(data.shape, np.uint8)
     halves = (slice(None, len(data) // 2), slice(len(data) // 2, None))
     with ThreadPoolExecutor(2) as pool:
@@ -125,7 +125,7 @@ def write_vertices(path: str | os.PathLike[str], vertices: npt.NDArray[Any], run
 def write_parts(
     path: str | os.PathLike[str], count: int, dtype: np.dtype[Any], parts: Iterable[npt.NDArray[Any]], run: str | None
 ) -> None:  # fmt: skip
-    """Do the same with so many vertices that come in parts, so that they need not be in memory together."""
+    """Write `count` vertices as `write_vertices` does, part by part, so that not all need to be in memory at once."""
     comments = [] if run is None else [f"gsseg_run {run}"]
     # An array that nobody touches takes no memory.
     element = plyfile.PlyElement.describe(np.empty(count, dtype), "vertex", comments=comments)

@@ -1,4 +1,4 @@
-"""3DGS PLYs, and those of relatives that would look right and be wrong: Mip-Splatting, 2DGS, and colours as bytes."""
+"""3DGS PLYs, and relatives that would be misread as such: of Mip-Splatting, of 2DGS, and with colours as bytes."""
 
 from __future__ import annotations
 

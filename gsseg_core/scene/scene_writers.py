@@ -20,13 +20,13 @@ if TYPE_CHECKING:
 class SceneWriter(NamedTuple):
     """A format that scenes are written in.
 
-    What writes takes the path of an empty file, a `GaussianScene` (a sequence of `SceneObject`, where these are kept
+    Its function takes the path of an empty file, a `GaussianScene` (or a sequence of `SceneObject`, if it keeps objects
     apart) and the id of a run or None.
     """
 
     name: str  # what messages call it
     suffixes: tuple[str, ...]  # of its files; the first is what gsseg gives them
-    write: str = ""  # as "module:function", imported when it is used; "" is `GaussianScene.save`
+    write: str = ""  # its function as "module:function", imported when it is used; "" is `GaussianScene.save`
     extra: str = ""  # the extra of gsseg with the library that this needs, if it needs one
     together: bool = False  # whether a file holds several objects and keeps them apart
 
@@ -83,10 +83,10 @@ def writer_of(name: str) -> Any:
 
 
 def format_of(path: str | os.PathLike[str], asked: str | None = None) -> str:
-    """Name of the format for a file: what is asked for; else what its suffix says, and PLY if that says nothing.
+    """Name of the format for a file: the one that is asked for, else that of its suffix, else PLY.
 
-    Raises `SettingsError` where the suffix says another format than the one that is asked for, or one that gsseg reads
-    only, and as `check_format` does of what is asked for.
+    Raises `SettingsError` where the suffix is that of another format than is asked for, or of one that gsseg only
+    reads, and what `check_format` raises of what is asked for.
     """
     from gsseg_core.scene.scene_formats import SCENE_FORMATS  # `gsseg --help` does without.
 
@@ -95,17 +95,17 @@ def format_of(path: str | os.PathLike[str], asked: str | None = None) -> str:
     file = Path(path).name.lower()
     fits = {suffix: name for name, writer in SCENE_WRITERS.items() for suffix in writer.suffixes}
     suffix = max(filter(file.endswith, fits), key=len, default=None)
-    said = None if suffix is None else fits[suffix]
-    only_read = None if said else next((known for known in SCENE_FORMATS if file.endswith(known.suffixes)), None)
+    by_suffix = None if suffix is None else fits[suffix]
+    only_read = None if by_suffix else next((known for known in SCENE_FORMATS if file.endswith(known.suffixes)), None)
     if only_read:
         suffixes = ", ".join(writer.suffixes[0] for writer in SCENE_WRITERS.values())
         raise SettingsError(
             f"{path}: has the suffix of {only_read.name}, which gsseg reads and does not write; expected {suffixes}"
         )
-    if asked is None or said in (None, asked):
-        return asked or said or DEFAULT
+    if asked is None or by_suffix in (None, asked):
+        return asked or by_suffix or DEFAULT
     raise SettingsError(
-        f"{path}: has the suffix of the format {said}, but {asked} is asked for; expected the suffix "
+        f"{path}: has the suffix of the format {by_suffix}, but {asked} is asked for; expected the suffix "
         f"{SCENE_WRITERS[asked].suffixes[0]}"
     )
 
@@ -132,7 +132,6 @@ def write_scene(
         The file cannot be written; an earlier one is unchanged.
     """
     name = format_of(path, scene_format)
-    check_format(name)
     if SCENE_WRITERS[name].together:
         write_objects([SceneObject(scene)], path, name, run)
         return

@@ -147,7 +147,7 @@ def _extremes(values: Any, what: str) -> npt.NDArray[np.float32]:
 
 
 def _rotations(pixels: Pixels) -> npt.NDArray[np.float32]:
-    """Quaternions (N, 4): alpha tells which of w, x, y, z is largest, the colours are the others."""
+    """Quaternions (N, 4) of pixels: alpha tells which of w, x, y, z is largest, the colours are the other three."""
     largest = pixels[:, 3].astype(np.int64) - 252
     if largest.min(initial=0) < 0:
         raise UnfitError(f"has rotations of kind {pixels[:, 3].min()}; expected 252 to 255 (is the image lossless?)")

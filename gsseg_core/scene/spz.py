@@ -116,7 +116,7 @@ def _header(content: bytes) -> _Header:
 
 
 def _check_packed(header: _Header, size: int) -> None:
-    """Raise `UnfitError`, before anything is inflated, if a file of this size would have to be packed too densely."""
+    """Raise `UnfitError`, before anything is inflated, if a file of this size cannot hold what its header claims."""
     claimed = header.gaussians * sum(header.sizes)
     check_size(size * (_DENSEST if claimed <= _SMALL else _DENSE), claimed, f"{header.gaussians:,} Gaussians")
 
@@ -129,7 +129,7 @@ def _rows(read: Read, count: int, size: int) -> npt.NDArray[np.uint8]:
 
 
 def _inflate(file: Any, length: int) -> tuple[_Header, str, Iterator[Read]]:
-    """Inflate what gzip packed, versions 1 to 3: readers of attributes, each to be read before the next is taken."""
+    """Open gzip, of versions 1 to 3: header, axes, and a reader of each attribute, to be read to its end in turn."""
     stream = gzip.GzipFile(fileobj=file)
     header = _header(stream.read(_HEADER.size))
     if header.version > 3:
@@ -147,7 +147,7 @@ def _inflate(file: Any, length: int) -> tuple[_Header, str, Iterator[Read]]:
 
 
 def _streams(file: BufferedReader, length: int, path: Path) -> tuple[_Header, str, Iterator[Read]]:
-    """Take the streams of version 4 apart, as `_inflate` does; those of no bytes are left out of the file."""
+    """Open the streams of version 4, as `_inflate` does; the file leaves out those of no bytes."""
     try:
         from zstandard import ZstdDecompressor, ZstdError
     except ImportError as error:
@@ -161,7 +161,7 @@ def _streams(file: BufferedReader, length: int, path: Path) -> tuple[_Header, st
     wanted = [header.gaussians * size for size in header.sizes if header.gaussians * size]
     if header.version < 4 or not _HEADER_4 <= table <= 1 << 20 or count != len(wanted):
         raise UnfitError(f"has {count} streams in version {header.version}; expected {len(wanted)}, and version 4")
-    system = _axes_said(file.read(table - _HEADER_4)) if header.flags & _EXTENSIONS else "RUB"
+    system = _axes_of(file.read(table - _HEADER_4)) if header.flags & _EXTENSIONS else "RUB"
     file.seek(table)
     sizes = struct.unpack(f"<{2 * count}Q", file.read(16 * count))
     _check_packed(header, length)
@@ -185,7 +185,7 @@ def _streams(file: BufferedReader, length: int, path: Path) -> tuple[_Header, st
     return header, system, every
 
 
-def _axes_said(extensions: bytes) -> str:
+def _axes_of(extensions: bytes) -> str:
     """Find the axes in the extensions: records of a type, a length, and as many bytes."""
     place = 0
     while place + 8 <= len(extensions):

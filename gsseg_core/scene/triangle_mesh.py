@@ -27,7 +27,7 @@ class TriangleMesh(NamedTuple):
             self.write(temporary, run)
 
     def write(self, path: Path, run: str | None = None) -> None:
-        """Write an OBJ where nobody reads it yet."""
+        """Write an OBJ into a temporary file."""
         with open(path, "w", encoding="ascii") as file:
             file.write(LONE if run is None else f"# gsseg_run {run}\n")
             np.savetxt(file, self.points, "v %.9g %.9g %.9g")

@@ -17,9 +17,9 @@ from gsseg_core.scene.lens import Lens, Projection
 
 WIDEST = math.radians(60)  # how far a pinhole view reaches to each side; beyond, pixels grow without bound
 GROWTH = (0.5, 2.0)  # sizes that a view may have, as multiples of its image's; no real lens comes near
-_AS_IT_IS = (1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0)
+_IDENTITY = (1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0)
 _FACES = {
-    "front": _AS_IT_IS,
+    "front": _IDENTITY,
     "right": (0.0, 0.0, 1.0, 0.0, 1.0, 0.0, -1.0, 0.0, 0.0),
     "back": (-1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, -1.0),
     "left": (0.0, 0.0, -1.0, 0.0, 1.0, 0.0, 1.0, 0.0, 0.0),
@@ -40,7 +40,7 @@ class Undistortion:
     height: int  # of the view, in pixels
     focal: tuple[float, float]  # focal lengths along x and y, in pixels
     principal: tuple[float, float]  # principal point, x and y in pixels
-    rotation: tuple[float, ...] = _AS_IT_IS  # (3, 3) row by row: from the axes of the view to those of the lens
+    rotation: tuple[float, ...] = _IDENTITY  # (3, 3) row by row: from the axes of the view to those of the lens
     face: str = ""  # which of several views of the image it is; "" if there is one only
 
     @property
@@ -140,7 +140,7 @@ def _landings(view: Undistortion) -> Iterator[tuple[slice, npt.NDArray[np.float6
 
 @lru_cache(maxsize=_MAPS_KEPT)
 def _nearest_pixels(view: Undistortion) -> npt.NDArray[np.int32]:
-    """Which pixel of the image, row * width + column, is seen in each of a view, (height, width); -1 for none."""
+    """Pixel of the image, row * width + column, that each pixel of a view shows, (height, width); -1 for none."""
     pixels = np.empty((view.height, view.width), np.int32)
     for rows, landed, inside in _landings(view):
         places = landed.astype(np.int32)

@@ -82,7 +82,7 @@ def pack_vertices(
 
 
 def pack_in_blocks(count: int, pack: Callable[[slice], npt.NDArray[np.void]]) -> npt.NDArray[np.void]:
-    """Pack (N,) Gaussians by `pack` of one slice after the other: what lies between fits into the processor's cache."""
+    """Pack Gaussians, (N,), slice after slice by `pack`, so that its arrays fit into the processor's cache."""
     first = pack(slice(0, BLOCK))
     if count <= BLOCK:
         return first
@@ -102,7 +102,7 @@ def columns(vertices: npt.NDArray[np.void], names: tuple[str, ...]) -> npt.NDArr
 
 
 def chosen(vertices: npt.NDArray[np.void], index: npt.NDArray[np.integer]) -> npt.NDArray[np.void]:  # (N,), (M,)
-    """Take vertices, (M,), as plain bytes: NumPy takes records field after field, in ten times the time."""
+    """Take vertices, (M,), as bytes: as records, NumPy would take them field by field, in ten times the time."""
     return np.take(vertices.view(f"V{vertices.itemsize}"), index).view(vertices.dtype)
 
 
@@ -114,7 +114,7 @@ def put(vertices: npt.NDArray[np.void], names: tuple[str, ...], values: npt.NDAr
 
 def logits(opacities: npt.NDArray[np.floating]) -> npt.NDArray[np.float64]:
     """Logits of opacities in [0, 1], kept finite; of what is no opacity, NaN, which validation reports."""
-    with np.errstate(invalid="ignore"):  # There are NaN that are signalled when they are converted.
+    with np.errstate(invalid="ignore"):  # Converting a signalling NaN warns.
         given = np.asarray(opacities, np.float64)
     inside = np.clip(np.where((given >= 0) & (given <= 1), given, np.nan), _MARGIN, 1 - _MARGIN)
     return np.log(inside / (1 - inside))

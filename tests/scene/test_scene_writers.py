@@ -141,6 +141,16 @@ def test_no_opacity_becomes_infinite_as_a_logit(tmp_path: Path, name: str) -> No
     assert (found > 0).all() and (found < 1).all() and np.abs(found - opacities).max() < 1 / 200
 
 
+def test_what_lies_beyond_the_ranges_of_spz_is_clipped_to_them(tmp_path: Path) -> None:
+    scene = some_scene(2)
+    sh = np.tile(np.array([[[9.0]], [[-9.0]]]), (1, 16, 3))
+    beyond = GaussianScene.from_arrays(scene.means, scene.quats, [[1e4] * 3, [1e-8] * 3], scene.opacities, sh)
+    found = GaussianScene.load(written(tmp_path, "spz", beyond))
+    np.testing.assert_allclose(np.log(found.scales), [[255 / 16 - 10] * 3, [-10] * 3], rtol=1e-6)
+    np.testing.assert_allclose(found.sh[:, 0], [[10 / 3] * 3, [-10 / 3] * 3], rtol=1e-6)
+    assert np.abs(found.sh[:, 1:]).max() <= 1
+
+
 def test_positions_as_far_away_as_spz_goes_are_kept_and_farther_ones_refused(tmp_path: Path) -> None:
     scene = some_scene(100, 0)
 

@@ -1,4 +1,4 @@
-"""Scenes turned to the axes that a format defines, and values bounded to what eight bits can say.
+"""Scenes turned to the axes that a format defines, and opacities bounded for formats of eight bits.
 
 The y axis of a 3DGS PLY points down by custom, as cameras' do. Formats that define y as up hold scenes turned by half a
 turn. Half a turn about an axis of the scene changes signs and nothing else: of two coordinates, of the same two parts
@@ -34,7 +34,7 @@ def turned(scene: GaussianScene, signs: tuple[int, int, int]) -> Turned:
 
 
 def logits_of_bytes(scene: GaussianScene) -> npt.NDArray[np.float32]:
-    """Logits (N,) of opacities that stay finite when they are rounded to eight bits: none is 0 or 255.
+    """Logits (N,) of opacities that eight bits round to neither 0 nor 255, so that they stay finite.
 
     No pixel shows the difference: alphas end at 0.99, and below 1/255 nothing is drawn.
     """

@@ -1,7 +1,7 @@
 """PlayCanvas SOG, version 2: lossless images in a zip, a pixel for each Gaussian, in the order given.
 
-The format asks for no order, though it is named after one. Its other writers sort the Gaussians, which makes images a
-little smaller and takes labels apart from what they belong to.
+The format does not ask for the order that it is named after. Its other writers sort the Gaussians, which makes images a
+little smaller, but labels in the order of the scene no longer fit.
 """
 
 from __future__ import annotations
@@ -79,9 +79,10 @@ def _pixels(values: npt.NDArray[Any]) -> npt.NDArray[np.uint8]:  # (N, C), whole
 
 
 def _coded(values: npt.NDArray[np.float32]) -> tuple[list[float], npt.NDArray[np.uint8]]:  # (M, C)
-    """Replace values by the nearest of 256, which are returned first: Lloyd's quantiser, from quantiles and even steps.
+    """Fit a code book of 256 values, and find the nearest for each value: Lloyd's quantiser, (256,) and (M, C).
 
-    Quantiles alone would leave the few large values to the ends, even steps the many small ones to a few.
+    It starts from quantiles and even steps: quantiles alone would have too few codes for the few large values, even
+    steps too few for the many small ones.
     """
     # Whole rows: every third number of all would be those of one axis, or of one colour.
     seen = np.sort(values[:: max(1, values.size // _SAMPLE)], axis=None).astype(np.float64)
@@ -96,7 +97,7 @@ def _coded(values: npt.NDArray[np.float32]) -> tuple[list[float], npt.NDArray[np
 
 
 def _smallest_three(quats: npt.NDArray[np.float32]) -> npt.NDArray[np.uint8]:  # (N, 4) w, x, y, z, unit
-    """Three components of each quaternion without its largest, which they tell, and 252 + which that is: (N, 4)."""
+    """Code quaternions, (N, 4): the three smallest components, and 252 + the index of the largest, which they imply."""
     largest = np.abs(quats).argmax(axis=1)[:, None]
     signed = quats * np.where(np.take_along_axis(quats, largest, axis=1) < 0, -1, 1)
     others = signed[np.arange(4) != largest].reshape(-1, 3)
@@ -105,7 +106,7 @@ def _smallest_three(quats: npt.NDArray[np.float32]) -> npt.NDArray[np.uint8]:  #
 
 
 def _palette(values: npt.NDArray[np.float32]) -> tuple[npt.NDArray[np.float32], npt.NDArray[np.int64]]:  # (N, D)
-    """Entries (K, D) that stand for all values, and which of them stands for each, (N,).
+    """Choose entries (K, D) that stand for all values, and the index of the one for each, (N,).
 
     K-means of two levels: a few coarse clusters, and in each of them as many entries as fit its size. That compares
     each value with some hundreds of entries, not with tens of thousands.
@@ -138,7 +139,7 @@ def _k_means(
     _, first = np.unique(entries.view(f"V{entries.itemsize * entries.shape[1]}"), return_index=True)
     entries, count = entries[np.sort(first)], len(first)
     for step in range(_STEPS):
-        # Whoever has few entries for many values need not ask all of these where the entries go.
+        # Where entries go, a sample of the values tells well enough, if there are many for each entry.
         sample = values if step == _STEPS - 1 else values[rng.permutation(len(values))[: max(count * 64, 1 << 14)]]
         index = _nearest(entries, sample)
         order, number = np.argsort(index, kind="stable"), np.bincount(index, minlength=count)

@@ -19,7 +19,8 @@ _LARGEST = 2**23 - 1  # positions are 24-bit numbers, with as many fractional bi
 def write_spz(path: Path, scene: GaussianScene, run: str | None) -> None:
     """Write a scene as SPZ; there is no place in it for the id of a run.
 
-    Raises `SceneValueError` where a Gaussian lies farther from the origin than the format can say.
+    Scales and coefficients beyond the ranges that docs/formats.md has are clipped to them. Raises `SceneValueError`
+    where a Gaussian lies farther from the origin than the format can say.
     """
     farthest = float(np.abs(scene.means).max())
     bits = 24 if farthest == 0 else min(24, math.floor(math.log2(_LARGEST / farthest)))

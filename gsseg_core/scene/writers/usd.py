@@ -55,7 +55,7 @@ def write_usd(path: Path, objects: Sequence[SceneObject], run: str | None) -> No
 
 
 def _identifier(one: SceneObject) -> str:
-    """Name of an object's prim; the id of its class keeps those apart whose names differ in other characters only."""
+    """Name of an object's prim; with the id of its class, as names may differ only in characters that are left out."""
     if one.label is None:
         return "scene"
     return f"class_{one.label}_{re.sub(r'[^0-9A-Za-z]+', '_', one.name)[:100]}".rstrip("_")
