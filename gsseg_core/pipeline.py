@@ -24,7 +24,7 @@ from gsseg_core.export.view_pictures import (
     Drawn,
     draw_views,
     draw_worst_views,
-    look_at,
+    look_and_draw,
     view_file_name,
     write_overview,
     write_pictures,
@@ -202,7 +202,7 @@ def segment(
             with watch.stage("carve"):
                 asked = {view.name for view in inputs.pictured}
                 asked |= {check.name for check in shown_views(assessment.checks or ())}
-                look = partial(look_at, inputs.scene, result, asked, drawn, device)
+                look = partial(look_and_draw, inputs.scene, result, asked, drawn, device)
                 result = result.carved_by(inputs.scene, inputs.looked_at, look, device)
         with watch.stage("pictures"):
             left = [view for view in inputs.pictured if view.name not in drawn]

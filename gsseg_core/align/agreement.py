@@ -5,9 +5,9 @@ quarter sees the same picture turned. Edges are compared, by normalised cross co
 where they are in another light. Masks have no edges of light but outlines, which lie at edges of colour or depth; and
 their regions have colours of their own, so the share of the rendered variance that they explain counts, too.
 
-What pictures score that do not belong together depends on the scene: one is like another on a table, and nothing like
-it in a house. So each rendering is compared with what the other views show as well, and with what its own shows upside
-down. Only what a view scores above that says anything.
+How much pictures of different places agree by chance depends on the scene: views of a table are much alike, those of
+rooms are not. So each rendering is also compared with what the other views show, and with its own view upside down.
+Only what a view scores above that counts.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ from gsseg_core.several_at_once import several_at_once
 
 LUMINANCE = np.array([0.299, 0.587, 0.114], np.float32)  # of RGB, ITU-R BT.601
 _EDGE_PX = 3  # reach of the filter that finds edges, px of a picture
-_WIDEST = 1e4  # tangent of half the field of view at which whoever states it cannot mean it
+_WIDEST = 1e4  # tangent of half the field of view; a camera that claims more is broken
 _NEAREST = 1e-3  # depth in scene units below which logarithms are not taken
 
 
@@ -45,7 +45,7 @@ class Rendered(NamedTuple):
     colours: np.ndarray  # (S, S, 3) float32
 
     def turned(self, quarters: int) -> Rendered:
-        """Turn the camera about its axis, by quarters of a turn clockwise as it sees itself."""
+        """Turn the camera clockwise about its axis, by quarters of a turn."""
         edges = np.rot90(self.edges, quarters, (1, 2))
         return Rendered(edges, np.rot90(self.colours, quarters))
 
@@ -82,7 +82,7 @@ class Agreement:
     views: int  # how many
     score: float  # of the views, 0 to 1
     chance: float  # of pictures that do not belong together
-    agrees: bool | None  # whether cameras and scene belong together; None where nobody can tell
+    agrees: bool | None  # whether cameras and scene belong together; None where that is undecided
 
     def __str__(self) -> str:
         """Describe it for people."""
@@ -99,7 +99,7 @@ def look_at(views: Sequence[View], settings: AlignSettings) -> list[Shown]:
         for view in spread([view for view in views if readable(view)], settings.views):
             try:
                 picture = read(view, settings.picture_px)
-            except GssegError:  # Who learns from it says what is wrong with it.
+            except GssegError:  # Learning from it reports what is wrong.
                 continue
             if picture is not None:
                 shown.append(picture)
@@ -117,7 +117,7 @@ def agreement(
     few = thinned(scene, settings.gaussians)
 
     def compared(view: Shown) -> tuple[float, list[float]]:
-        """Render a view, and score upside down what it shows itself, and what all views show."""
+        """Render a view, and score its own picture upside down, and the pictures of all views."""
         picture = render(few, view.camera, device)
         return view.upside_down().score(picture), [each.score(picture) for each in shown]
 

@@ -7,8 +7,8 @@ along another; and whether a pose leads from camera to world or back. A pose M, 
     A M B  or  A M^-1 B,    A and B among the 24 rotations that map axes to axes,
 
 and all 1152 are tried. Each is compared with one view after another, and only the best go on to the next view. Those
-that differ by a quarter turn about the optical axis share a rendering, which is turned. What counts is by how much a
-view agrees more than upside down: much of what is seen from a wrong place agrees equally well both ways.
+that differ by a quarter turn about the optical axis share a rendering, which is turned. What counts is how much better
+a view agrees than it does upside down: from a wrong place, much agrees equally well both ways.
 """
 
 from __future__ import annotations
@@ -26,6 +26,7 @@ from gsseg_core.align.settings import AlignSettings
 from gsseg_core.progress import Progress, silent, with_progress
 from gsseg_core.scene.camera import Camera, rigid_motion
 from gsseg_core.scene.gaussian_scene import GaussianScene
+from gsseg_core.scene.scene_delta import similarity_entry
 from gsseg_core.scene.similarity import Similarity
 
 _NAMES = "xyz"
@@ -86,7 +87,7 @@ class Convention:
 
 @dataclass(frozen=True, eq=False)
 class Alignment:
-    """Poses of a dataset's cameras in a scene: how they are to be understood, and then where their frame lies."""
+    """How a dataset's cameras come into a scene: the convention of their poses, then a similarity."""
 
     convention: Convention = field(default_factory=Convention)  # how poses are to be understood
     similarity: Similarity = field(default_factory=Similarity)  # from the frame that they are then in to the scene's
@@ -115,9 +116,7 @@ class Alignment:
             "inverted": self.convention.inverted,
             "world_axes": self.convention.world_axes.tolist(),
             "camera_axes": self.convention.camera_axes.tolist(),
-            "scale": self.similarity.scale,
-            "rotation": self.similarity.rotation.tolist(),
-            "translation": self.similarity.translation.tolist(),
+            **similarity_entry(self.similarity),
         }
 
 
@@ -138,7 +137,7 @@ def find_convention(
         for i in with_progress(progress, f"try conventions on view {number + 1} of {len(shown)}", left):
             rendered = render(scene, tried[i].camera(view.camera), device)
             turned = np.array([view.score(rendered.turned(quarters)) for quarters in range(4)])
-            scores[i] += turned - np.roll(turned, 2)  # above that of the same upside down
+            scores[i] += turned - np.roll(turned, 2)  # less the score upside down
         kept = max(_LEAST, round(settings.survivors * len(left)))
         left = sorted(left, key=lambda i: -float(scores[i].max()))[:kept]
     best = max(left, key=lambda i: float(scores[i].max()))

@@ -1,7 +1,7 @@
-"""Features of photos and of renderings, and which are of the same point; by COLMAP's SIFT.
+"""Features of photos and of renderings, by COLMAP's SIFT, and matches between them.
 
-A feature of a rendering has a place in the scene, where its pixel's depth says. So a match with a photo ties a pixel
-of that photo to a point of the scene.
+The depth of a rendering's pixel gives its feature a point in the scene. So a match with a photo is a correspondence of
+a pixel of that photo and a point of the scene.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ class Features(NamedTuple):
 
 
 class Photo(NamedTuple):
-    """A photo to be located: its camera as the dataset has it, shrunk to what is matched, and its features."""
+    """A photo to be located: its camera as the dataset has it, at the size that is matched, and its features."""
 
     camera: Camera
     features: Features
@@ -51,7 +51,7 @@ class Extractor:
             raise AlignmentError(
                 "locating photos in a scene needs pycolmap, which is missing: pip install pycolmap"
             ) from missing
-        pycolmap.logging.minloglevel = max(pycolmap.logging.minloglevel, 1)  # It tells each time that it was made.
+        pycolmap.logging.minloglevel = max(pycolmap.logging.minloglevel, 1)  # It logs every extractor that it makes.
         options = pycolmap.FeatureExtractionOptions()
         options.use_gpu, options.num_threads = False, 1
         options.sift.max_num_features = settings.features
@@ -88,7 +88,7 @@ class PhotosInScene:
         return cls(photos, scene, extractor, settings, device)
 
     def rendering(self, camera: Camera) -> Features:
-        """Render the scene, and find the features with their points; those at the edge of nothing are left out."""
+        """Render the scene, and find features with their points; those where the scene is not opaque are left out."""
         image, left_over = colours_and_depth(self.scene, make_operator(self.scene, camera, self.device))
         found = self.extractor.photo(image[..., :3] @ LUMINANCE)
         column, row = np.clip(found.pixels.astype(int), 0, (camera.width - 1, camera.height - 1)).T
@@ -101,9 +101,9 @@ class PhotosInScene:
 
 
 def matches(photo: Features, rendering: Features, ratio: float, within_px: float = np.inf) -> np.ndarray:
-    """Match features that are each other's nearest, and nearer than `ratio` times the second: pairs (P, 2).
+    """Match features that are each other's nearest, and nearer than `ratio` times the second: indices (P, 2).
 
-    With `within_px`, a feature is looked for only so far from its own place.
+    With `within_px`, only features that are no farther apart in the two pictures.
     """
     if min(len(photo.pixels), len(rendering.pixels)) < 2:
         return np.zeros((0, 2), int)

@@ -1,4 +1,4 @@
-"""Cameras of a dataset put where they are in a scene: by nerfstudio's own file, as it is there, or as it is found."""
+"""Cameras of a dataset put where they are in a scene: by nerfstudio's file, as the dataset has them, or as found."""
 
 from __future__ import annotations
 
@@ -23,17 +23,18 @@ from gsseg_core.progress import Progress, silent
 from gsseg_core.scene.gaussian_scene import GaussianScene
 from gsseg_core.scene.similarity import Similarity
 
-_CLOSE_PX = 1.0  # photos and renderings that are nearer than this are as they should be
+_CLOSE_PX = 1.0  # photos and renderings that are no farther apart lie upon each other
 
 
 @dataclass(frozen=True, eq=False)
 class Found:
-    """An alignment, and how well the scene agrees with the views through it."""
+    """An alignment that was found, and how well the scene agrees with the views by it."""
 
     alignment: Alignment  # where the cameras are
     agreement: Agreement  # of the scene, with what the cameras show there
     before: Agreement  # with the cameras where they were
-    offset_px: float | None = None  # median from features of photos to those of renderings, px at 480 px; None without
+    # Median distance of features of photos from those of renderings, px of photos 480 px long; None without photos.
+    offset_px: float | None = None
 
     def as_dict(self) -> dict[str, Any]:
         """Give it as `report.json` does."""
@@ -88,9 +89,9 @@ def place(
 ) -> Placed:
     """Put the cameras of a dataset where they are in a scene.
 
-    `dataparser` is nerfstudio's `dataparser_transforms.json`, which lies beside the trained config. If it lies beside
-    the scene or in the dataset, it is found. Raises `AlignmentError` where it cannot be found where the cameras are;
-    `CameraFileError` or `PoseError` if that file is broken, or says nothing of cameras of this format.
+    `dataparser` is nerfstudio's `dataparser_transforms.json`, which lies beside the trained config; one beside the
+    scene or in the dataset is found. Raises `AlignmentError` where no place is found for the cameras, and
+    `CameraFileError` or `PoseError` where that file is broken, or says nothing of cameras of this format.
     """
     settings, file = AlignSettings(), None
     if found := _frame_of_training(scene, dataset, dataparser):
@@ -112,9 +113,9 @@ def find_alignment(
 ) -> Found:
     """Find where cameras are in a scene, from what their photos show or, without photos, their masks.
 
-    First as they are, if photos tell, then by conventions, and at last, with photos, by a similarity. The first one is
-    taken in which photos and renderings lie upon each other, and where none is, the one that agrees best. Raises
-    `AlignmentError` where nothing agrees.
+    With photos, the cameras are tried as they are, then by conventions, and at last by a similarity; with masks, by
+    conventions alone. Taken is the first alignment by which photos and renderings lie upon each other, or else the one
+    that agrees best. Raises `AlignmentError` where none agrees.
     """
     search = _Search(scene, views, settings or AlignSettings(), device)
     before = agreement(scene, search.shown, search.settings, device)
@@ -124,10 +125,10 @@ def find_alignment(
         )
     photos = before.compared == "photos"
     agreeing: list[Found] = []
-    # Masks say less than photos do: on a shelf, regions may lie well enough from a wrong side, too.
+    # Masks say less than photos do: the regions of a shelf may agree from a wrong side, too.
     if before.agrees and photos:
         as_they_are = search.closer(Found(Alignment(), before, before))
-        # Nothing was compared with it yet, and round a table other sides look alike.
+        # Agreement alone is not enough: all sides of a table look alike.
         if as_they_are.offset_px is not None and as_they_are.offset_px <= _CLOSE_PX:
             return as_they_are
         agreeing.append(as_they_are)
@@ -188,7 +189,7 @@ class _Search:
         )
 
     def closer(self, found: Found) -> Found:
-        """Fit what is about right to the photos, if there are any and they are not yet close to the renderings."""
+        """Refine an alignment by the photos, if there are any and they are not yet close to the renderings."""
         if found.agreement.compared != "photos":
             return found
         from gsseg_core.align.refinement import offset_px, refined
@@ -202,7 +203,7 @@ class _Search:
         return replace(found, offset_px=offset)
 
     def through(self, alignment: Alignment) -> Agreement:
-        """Compare the scene with the views, of which there are some, after their cameras are moved."""
+        """Compare the scene with the views, at least one, after their cameras are moved."""
         moved = [replace(view, camera=alignment.camera(view.camera)) for view in self.shown]
         compared = agreement(self.scene, moved, self.settings, self.device)
         assert compared is not None

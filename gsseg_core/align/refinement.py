@@ -1,8 +1,8 @@
-"""The last pixels of a similarity: renderings from moved cameras are matched with their photos, and the rest is fitted.
+"""Refinement of a similarity that is right to a few pixels, by matches of photos with renderings from moved cameras.
 
-From nearly the right place a rendering looks as its photo, so hundreds of features match in each, and all photos
-together determine seven numbers: a rotation, a translation and a scale, by least squares over all reprojection errors.
-Large errors count by their size, not its square, since matches may be wrong and surfaces of a scene badly trained.
+From nearly the right place a rendering looks like its photo, so hundreds of features match in each. All photos together
+determine seven numbers, a rotation, a translation and a scale, by least squares over all reprojection errors. Large
+errors count by their size, not its square, since matches may be wrong and surfaces of a scene badly trained.
 """
 
 from __future__ import annotations
@@ -23,8 +23,8 @@ _SEARCH_PX = (40.0, 12.0, 6.0)  # how far from its place a feature is looked for
 _LEAST = 20  # matches from which seven numbers are fitted
 
 
-class _Ties(NamedTuple):
-    """Pixels of photos with their points in the scene."""
+class _Correspondences(NamedTuple):
+    """Pixels of photos with their points in the scene, and the cameras of the photos."""
 
     rotations: np.ndarray  # (P, 3, 3): of the photo's camera, world to camera
     translations: np.ndarray  # (P, 3)
@@ -42,20 +42,20 @@ class _Ties(NamedTuple):
 def refined(photos: PhotosInScene, alignment: Alignment) -> Alignment:
     """Fit the similarity of an alignment to all photos; where hardly anything matches, it is returned as it was."""
     for step in range(photos.settings.refinements):
-        ties = _ties(photos, photos.photos, alignment, _SEARCH_PX[min(step, len(_SEARCH_PX) - 1)])
-        if len(ties.pixels) < _LEAST:
+        found = _match(photos, photos.photos, alignment, _SEARCH_PX[min(step, len(_SEARCH_PX) - 1)])
+        if len(found.pixels) < _LEAST:
             return alignment
-        alignment = Alignment(alignment.convention, _fit(ties).inverse().after(alignment.similarity))
+        alignment = Alignment(alignment.convention, _fit(found).inverse().after(alignment.similarity))
     return alignment
 
 
 def offset_px(photos: PhotosInScene, alignment: Alignment) -> float | None:
     """How far some photos and renderings are apart, in px of the photos as matched: median over features of both."""
-    ties = _ties(photos, spread(photos.photos, photos.settings.views), alignment, _SEARCH_PX[0])
-    return float(np.median(np.linalg.norm(ties.errors(ties.points), axis=1))) if len(ties.pixels) >= _LEAST else None
+    found = _match(photos, spread(photos.photos, photos.settings.views), alignment, _SEARCH_PX[0])
+    return float(np.median(np.linalg.norm(found.errors(found.points), axis=1))) if len(found.pixels) >= _LEAST else None
 
 
-def _ties(photos: PhotosInScene, some: Sequence[Photo], alignment: Alignment, within_px: float) -> _Ties:
+def _match(photos: PhotosInScene, some: Sequence[Photo], alignment: Alignment, within_px: float) -> _Correspondences:
     """Match some of the photos with what the scene looks like from their cameras."""
     rows = []
     for camera, features in some:
@@ -69,21 +69,21 @@ def _ties(photos: PhotosInScene, some: Sequence[Photo], alignment: Alignment, wi
         repeated = (np.repeat(each[None], len(pairs), axis=0) for each in (pose[:3, :3], pose[:3, 3], lens))
         rows.append((*repeated, features.pixels[pairs[:, 0]], rendering.points[pairs[:, 1]]))
     if not rows:
-        return _Ties(*(np.zeros((0, *shape)) for shape in ((3, 3), (3,), (4,), (2,), (3,))))
-    return _Ties(*(np.concatenate(column) for column in zip(*rows, strict=True)))
+        return _Correspondences(*(np.zeros((0, *shape)) for shape in ((3, 3), (3,), (4,), (2,), (3,))))
+    return _Correspondences(*(np.concatenate(column) for column in zip(*rows, strict=True)))
 
 
-def _fit(ties: _Ties) -> Similarity:
+def _fit(found: _Correspondences) -> Similarity:
     """Fit the similarity that moves points of the scene to where the cameras see their pixels."""
-    middle = np.median(ties.points, axis=0)
-    size = max(float(np.median(np.abs(ties.points - middle))), 1e-9)
+    middle = np.median(found.points, axis=0)
+    size = max(float(np.median(np.abs(found.points - middle))), 1e-9)
 
     def similarity(values: np.ndarray) -> Similarity:  # (7,)
         rotation, scale = Rotation.from_rotvec(values[:3]).as_matrix(), float(np.exp(values[6]))
         return Similarity(scale, rotation, middle + size * values[3:6] - scale * rotation @ middle)
 
     fitted = least_squares(
-        lambda values: ties.errors(similarity(values).points(ties.points)).ravel(),
+        lambda values: found.errors(similarity(values).points(found.points)).ravel(),
         np.zeros(7), loss="soft_l1", f_scale=1.0,
     )  # fmt: skip
     return similarity(fitted.x)

@@ -1,10 +1,10 @@
 """Where photos were taken in a scene of which nothing is known: neither its scale, nor where up is.
 
 The scene is rendered from places all around and inside it, and features of each rendering are matched with those of
-some photos. Matches tie pixels to points of the scene, which is what the camera's pose follows from (RANSAC over three
-points, as COLMAP does it). One photo that is located so is enough for a start: rendered from its place, the scene looks
-like it, and so matches its neighbours, too. Two poses with the dataset's own make a similarity: the rotation is what
-turns cameras of the dataset into those that were found, the scale what brings their centres as far apart.
+some photos. Correspondences of pixels and points of the scene give the camera's pose (RANSAC over three points, as
+COLMAP does it). One photo that is located so is enough for a start: rendered from its place, the scene looks like it,
+and so matches its neighbours, too. Two located cameras and the dataset's own poses of them give a similarity: its
+rotation turns the dataset's cameras into the located ones, its scale makes their centres equally far apart.
 """
 
 from __future__ import annotations
@@ -26,14 +26,15 @@ from gsseg_core.scene.similarity import Similarity
 
 _SHELLS = (1.6, 1.0, 0.0, 2.5)  # radii of the scene at which it is looked at from outside; 0: from inside
 _SOLID = 0.3  # opacity from which on a Gaussian counts for the size of the scene
-_TURN_DEGREES, _SHIFT = 5.0, 0.1  # by which located cameras may miss those of one similarity; of the extent of centres
+# By how much a located camera may differ from the similarity's: its angle; its centre, of the extent of all centres.
+_TURN_DEGREES, _SHIFT = 5.0, 0.1
 
 
 class Located(NamedTuple):
-    """A camera where its photo was found to be taken, and how many matches say so."""
+    """A camera with the pose that was found for its photo, and the matches that agree with it."""
 
     camera: Camera
-    matches: int
+    inliers: int
 
 
 def candidates(photos: PhotosInScene, progress: Progress) -> Iterator[Alignment]:
@@ -47,7 +48,7 @@ def candidates(photos: PhotosInScene, progress: Progress) -> Iterator[Alignment]
         for _ in range(2):  # from where the surest one was taken, the scene looks like it
             if not found:
                 break
-            surest = max(found.values(), key=lambda located: located.matches)
+            surest = max(found.values(), key=lambda located: located.inliers)
             found = locate(photos.photos, photos.rendering(surest.camera), photos.settings)
         if len(found) > 1 and (guess := fit_poses(photos.photos, found)) is not None:
             yield guess
@@ -106,8 +107,8 @@ def fit_poses(photos: Sequence[Photo], found: Mapping[int, Located]) -> Alignmen
         given = _Poses.of([convention.camera(photos[number].camera) for number in found])
         for first, second in combinations(range(len(found)), 2):
             similarity = _between(given, located, first, second)
-            if similarity is not None and (fitting := _fitting(similarity, given, located)) > most:
-                best, most = Alignment(convention, similarity), fitting
+            if similarity is not None and (inliers := _inliers(similarity, given, located)) > most:
+                best, most = Alignment(convention, similarity), inliers
     return best
 
 
@@ -133,7 +134,7 @@ def _between(given: _Poses, located: _Poses, first: int, second: int) -> Similar
     return Similarity(scale, rotation, found_middle - scale * rotation @ middle)
 
 
-def _fitting(similarity: Similarity, given: _Poses, located: _Poses) -> int:
+def _inliers(similarity: Similarity, given: _Poses, located: _Poses) -> int:
     """Count the cameras that a similarity takes to about where they were located."""
     extent = float(np.ptp(located.centers, axis=0).max())
     near = np.linalg.norm(similarity.points(given.centers) - located.centers, axis=1) <= _SHIFT * extent

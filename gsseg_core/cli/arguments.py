@@ -48,7 +48,7 @@ class _Parser(argparse.ArgumentParser):
     def _refuse_unknown(self, arguments: Sequence[str]) -> None:
         known = list(self._option_string_actions)
         for argument in arguments:
-            # What follows these has an option's look, but need not be one.
+            # What follows these may look like an option without being one.
             if argument == "--" or (self._subparsers and not argument.startswith("-")):
                 return
             name = argument.split("=")[0]
@@ -77,10 +77,7 @@ def command_module(name: str) -> ModuleType:
 def build_parser(full: Collection[str] = COMMANDS.keys()) -> argparse.ArgumentParser:
     """Build the parser of the command line, from which help, tab completion and docs/ are made, too.
 
-    Parameters
-    ----------
-    full : collection of str
-        The commands whose arguments are needed; of the others there is but the name.
+    `full` are the commands whose arguments are needed; the others have only their names.
     """
     parser = _Parser(
         prog="gsseg",

@@ -43,7 +43,7 @@ EXAMPLES = """
 
 _REQUIREMENT = re.compile(r"(?P<name>[A-Za-z0-9._-]+)")
 _EXTRA = re.compile(r"""extra\s*==\s*["'](?P<extra>[^"']+)["']""")
-# For those who use gsseg; the extras for those who develop it are looked for by their own tools.
+# The extras for users; those for developers are looked for by their own tools.
 _EXTRAS_FOR = {
     "view": "gsseg view, the scene in the browser",
     "formats": "--format compressed-ply, spz; reading SPZ of version 4, YAML of masks",
@@ -126,7 +126,7 @@ def examine(say: Callable[[str], object] = lambda text: None) -> list[Finding]:
 
 
 def examine_scene(path: str) -> list[Finding]:
-    """Read a scene, and say its format, and what of it is lost; raises what `GaussianScene.load` raises."""
+    """Read a scene, and say its format, and what that keeps of it; raises what `GaussianScene.load` raises."""
     from gsseg_core.scene.gaussian_scene import GaussianScene
     from gsseg_core.scene.scene_formats import SCENE_FORMATS, find_format, read_scene
     from gsseg_core.text import clipped, counted
@@ -269,7 +269,7 @@ def _ros() -> Iterator[Finding]:
 
 
 def _requirements(extra: str) -> list[str]:
-    """List the names of packages that gsseg asks for, those of an extra, or ("") those that it always needs."""
+    """List the packages that an extra of gsseg needs, or, for "", those that gsseg always needs."""
     names = []
     for line in metadata.requires("gsseg") or []:
         name, belongs = _REQUIREMENT.match(line), _EXTRA.search(line)

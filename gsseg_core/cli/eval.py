@@ -65,7 +65,7 @@ def run(options: argparse.Namespace) -> int:
 
 
 def _holds_scores(path: Path) -> bool:
-    """Whether scores, or nothing, are in a file that is there, or would be there behind a link."""
+    """Whether a file holds scores, is empty, or does not exist, as behind a link that leads nowhere."""
     from gsseg_core.errors import GssegError
     from gsseg_core.files.json_files import read_object
 

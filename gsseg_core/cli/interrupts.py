@@ -1,8 +1,8 @@
 """Ctrl-C in the program `gsseg`: it ends with exit code 130, in silence.
 
-Python raises KeyboardInterrupt wherever it happens to be, and in an import, in a callback from C or at the end of the
-program nobody can catch that. So there the program leaves at once, which no file minds: all are written beside and
-renamed. Only while a command works the interrupt is raised, so that it can tidy up; a second one does not wait for it.
+Python raises KeyboardInterrupt wherever it happens to be; in an import, in a callback from C or at the end of the
+program nobody can catch it. There the program leaves at once, which harms no file: all are written under another name
+and renamed. Only while a command works is the interrupt raised, so that it can clean up; a second one ends the program.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 
 EXIT_CODE = 130
 
-_came = False
+_raised = False
 
 
 def leave_at_once() -> None:
@@ -32,13 +32,13 @@ def raise_once() -> None:
     _handle(_raise)
 
 
-def came() -> bool:
-    """Whether KeyboardInterrupt was raised; an error that arrives in its place is a consequence."""
-    return _came
+def was_raised() -> bool:
+    """Whether KeyboardInterrupt was raised; an error that arrives in its place follows from it."""
+    return _raised
 
 
 def _handle(handler: object) -> None:
-    # Who starts a program in the background may have it deaf to what is typed; it stays so.
+    # A program in the background may have been started to ignore Ctrl-C; it stays so.
     if signal.getsignal(signal.SIGINT) is not signal.SIG_IGN:
         signal.signal(signal.SIGINT, handler)  # type: ignore[arg-type]
 
@@ -48,8 +48,8 @@ def _leave(number: int, frame: FrameType | None) -> None:
 
 
 def _raise(number: int, frame: FrameType | None) -> None:
-    global _came
-    _came = True
+    global _raised
+    _raised = True
     _handle(_leave)
     raise KeyboardInterrupt
 

@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command line; returns the exit code: 0, 2 on an error of input or output, 130 when interrupted.
 
-    Without arguments it takes those of the process, of which it then is the program: it takes over Ctrl-C for good.
+    Without arguments it takes those of the process, and handles Ctrl-C from then on.
     """
     if arguments is None:
         interrupts.leave_at_once()
@@ -38,7 +38,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     except BrokenPipeError:
         return 0  # The reader of our output has left, as `head` does; there is nobody to tell.
     except Exception as error:
-        if interrupts.came():
+        if interrupts.was_raised():
             return interrupts.EXIT_CODE
         if isinstance(error, MemoryError):
             terminal.note(f"error: memory is not enough ({error}); expected smaller views, or a smaller scene")
@@ -80,7 +80,7 @@ def _refuse_empty(options: Namespace) -> None:
 
 
 def _check_threads() -> None:
-    """Raise `SettingsError` for what numba takes for no number of threads: in a traceback, or a warning with one."""
+    """Raise `SettingsError` for a number of threads that numba refuses, since it does so by a traceback."""
     from gsseg_core.errors import SettingsError
     from gsseg_core.text import quoted
 

@@ -13,7 +13,7 @@ from gsseg_core.progress import progress_bars
 from gsseg_core.scene.scene_writers import DEFAULT, SCENE_WRITERS
 from gsseg_core.text import quoted
 
-if TYPE_CHECKING:  # Loaded by those who pick alone: `gsseg --help` is quick.
+if TYPE_CHECKING:
     import numpy as np
 
     from gsseg_core.data.dataset import Dataset
@@ -21,7 +21,7 @@ if TYPE_CHECKING:  # Loaded by those who pick alone: `gsseg --help` is quick.
     from gsseg_core.scene.camera import Camera
     from gsseg_core.scene.gaussian_scene import GaussianScene
 
-CANDIDATES = 24  # cameras of which the next view is chosen, spread over all: neighbours in a capture see much the same
+CANDIDATES = 24  # cameras of which the next view is chosen, spread over all, as neighbours see much the same
 
 DESCRIPTION = """
 Finds the Gaussians of one object that is shown by a mask of one view, or of a few, and writes it as DIR/object.ply, or
@@ -90,7 +90,7 @@ def run(options: argparse.Namespace) -> int:
 
 
 def _names_of_views(options: argparse.Namespace, dataset: Dataset) -> list[str]:
-    """Find the views that are asked for, different ones, one for each mask."""
+    """Find the views that are asked for; `SettingsError` unless they exist, are different, and each has its mask."""
     from gsseg_core.data.mask_formats.place import view_of
 
     names = [camera.name for camera in dataset.cameras]

@@ -63,7 +63,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--no-filter": "neither cut objects nor filter them",
     }.items():
         add(name, action="store_true", help=effect)
-    # What is the default now had to be asked for.
+    # The default today, which once had to be asked for.
     add("--carve", dest="refine", action="store_const", const="carve", help=argparse.SUPPRESS)
 
 

@@ -13,8 +13,7 @@ from gsseg_core.errors import GssegError, PathTakenError, SettingsError
 from gsseg_core.raster.backends import devices, rasteriser_of
 from gsseg_core.scene.scene_writers import SCENE_WRITERS
 
-LABELS = "labels"
-"""Where the masks are in a dataset, unless `--labels` says something else."""
+LABELS = "labels"  # folder of the masks in a dataset, unless `--labels` names another
 
 
 def add_scene(parser: argparse.ArgumentParser) -> None:
@@ -70,11 +69,11 @@ def labels_path(options: argparse.Namespace) -> str:
 
 
 def note_frame(options: argparse.Namespace) -> None:
-    """Say so where the run of a segmentation has moved the cameras by a file or `--align`, and this one does not."""
+    """Warn if the run that made a segmentation moved the cameras, by a file or `--align`, and this one does not."""
     from gsseg_core.files.json_files import read_object
 
     report = Path(options.segmentation).parent / "report.json"
-    with suppress(GssegError, KeyError, TypeError):  # Without a report of a run that moved any, nothing is to be said.
+    with suppress(GssegError, KeyError, TypeError):  # There may be no report, or one of a run that moved none.
         frame = read_object(report, GssegError, "a report")["frame"]
         file = frame["dataparser"] and Path(frame["dataparser"])
         if file and not (options.dataparser or file.parent in (Path(options.scene).parent, Path(options.data))):
@@ -100,6 +99,6 @@ def _device(text: str) -> str:
 
 
 def check_not_read(out: str, what: str, path: str) -> None:
-    """Raise `PathTakenError` if a file to write, links followed, is one that is read, which is then called `what`."""
+    """Raise `PathTakenError` if a file to write is, links followed, a file that is read, which messages call `what`."""
     if os.path.exists(out) and os.path.exists(path) and os.path.samefile(out, path):
         raise PathTakenError(f"{out}: is the {what} that is read, and would be lost; expected another file")

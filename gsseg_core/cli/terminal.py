@@ -1,4 +1,4 @@
-"""Standard output and standard error of the command line: they may be closed, full, or of few characters."""
+"""Standard output and standard error of the command line: they may be closed, full, or of a poor encoding."""
 
 from __future__ import annotations
 
@@ -14,9 +14,9 @@ from gsseg_core.text import one_line
 
 
 def prepare() -> None:
-    """Have both streams take whatever is printed: what their encoding lacks, as escapes; if they are closed, nowhere.
+    """Have both streams take whatever is printed: what their encoding lacks as escapes, and nowhere if they are closed.
 
-    A file that is opened later must not get the number of a closed stream either.
+    A closed stream is opened anew, since a file that is opened later would get its number.
     """
     for name in ("stdout", "stderr"):
         stream = getattr(sys, name)
@@ -29,12 +29,8 @@ def prepare() -> None:
 def tell(text: str) -> None:
     """Print what a command has found.
 
-    Raises
-    ------
-    WriteError
-        Standard output cannot be written.
-    BrokenPipeError
-        Its reader has left, as `head` does.
+    Raises `WriteError` where standard output cannot be written, `BrokenPipeError` where its reader has left, as `head`
+    does.
     """
     with _named():
         print(text, flush=True)
@@ -55,8 +51,8 @@ def note(text: str) -> None:
 
 
 def abandon(stream: TextIO) -> None:
-    """Send the rest of a stream nowhere, since Python writes it at the end, and would complain."""
-    with contextlib.suppress(OSError, ValueError):  # It may be a stand-in, without a file.
+    """Send the rest of a stream nowhere: Python would write it at the end, and fail."""
+    with contextlib.suppress(OSError, ValueError):  # A replaced stream may have no descriptor.
         nowhere = os.open(os.devnull, os.O_WRONLY)
         os.dup2(nowhere, stream.fileno())
         os.close(nowhere)

@@ -108,13 +108,7 @@ def _show(options: argparse.Namespace, listener: Listener, viewer_module: Module
 
 
 def load_viewer() -> ModuleType:
-    """Import the viewer.
-
-    Raises
-    ------
-    SettingsError
-        viser is not installed.
-    """
+    """Import the viewer; `SettingsError` if viser is not installed."""
     try:
         from gsseg_core.viewer import viewer
     except ModuleNotFoundError as missing:

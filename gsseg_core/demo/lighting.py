@@ -1,4 +1,4 @@
-"""Light in the demo's room: a lamp with soft shadows, and a sky that contacts and insides see less of."""
+"""Light in the demo's room: a lamp with soft shadows, and a sky that is darkened where parts are close."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from gsseg_core.scene.spherical_harmonics import C0, basis
 LAMP = np.array([-0.9, -1.1, 2.9])
 LAMP_COLOR, SKY_COLOR = np.array([1.06, 1.0, 0.90]), np.array([0.96, 1.0, 1.05])
 
-REACH = 0.25  # m; what is farther away does not darken a place
+REACH = 0.25  # m; parts that are farther away do not darken a place
 RAYS = 10  # to the sky from each place; half as many to the lamp
 
 

@@ -10,8 +10,7 @@ from scipy import ndimage
 
 MISSED, SWAPPED = 0.15, 0.10  # probabilities that an object is missed, and that it gets the label of another one
 EDGE_PX = 3  # the outline of each object moves in or out by 0 to so many whole px, all as likely
-STREAMS = 4
-"""Streams of random numbers that a view's map gets, so that one kind of error leaves the draws of the others alone."""
+STREAMS = 4  # of random numbers for each view, so that one kind of error leaves the draws of the others alone
 
 
 def corrupt(labels: np.ndarray, rng: np.random.Generator) -> np.ndarray:

@@ -61,7 +61,7 @@ def build_demo(folder: str | os.PathLike[str], seed: int = 0) -> DemoScene:
     scene_rng, mask_rng = np.random.default_rng(seed).spawn(2)
     parts, cameras = furnish(), _make_cameras()
     viewpoints = np.array([camera.center for camera in cameras])
-    pieces = [_float(scene_rng), *(_cover(part, parts, viewpoints, scene_rng) for part in parts)]
+    pieces = [_floaters(scene_rng), *(_cover(part, parts, viewpoints, scene_rng) for part in parts)]
     *properties, truth = (np.concatenate(arrays) for arrays in zip(*pieces, strict=True))
     scene, truth = GaussianScene.from_arrays(*properties), truth.astype(np.int32)
     test = [camera.name for camera in cameras[TEST_EVERY // 2 :: TEST_EVERY]]
@@ -156,11 +156,11 @@ def _cover(part: Part, parts: list[Part], viewpoints: np.ndarray, rng: np.random
     points, normals = points[kept], normals[kept]
     n = len(points)
 
-    frames, room = _lay(part, points, normals, 2 * spacing)
+    frames, to_edge = _lay(part, points, normals, 2 * spacing)
     quats = np.roll(Rotation.from_matrix(frames).as_quat(), 1, axis=1)
-    wide = 0.78 if part.label else 1.0  # a wall has few, and no gaps
+    wide = 0.78 if part.label else 1.0  # the few discs of a wall leave no gaps
     scales = spacing * np.array([wide, wide, 0.07]) * rng.lognormal(0, [0.3, 0.3, 0.5], (n, 3))
-    scales[:, :2] = np.minimum(scales[:, :2], room / 1.4)
+    scales[:, :2] = np.minimum(scales[:, :2], to_edge / 1.4)
     means = points - normals * (0.5 * drawn_back + 0.06 * spacing * rng.normal(size=(n, 1)))
     opacities = np.where(rng.random(n) < 0.9, rng.beta(12, 1, n), rng.uniform(0.05, 0.6, n))
     sh = shade(part, parts, points, normals, rng)
@@ -172,27 +172,27 @@ def _cover(part: Part, parts: list[Part], viewpoints: np.ndarray, rng: np.random
 
 
 def _lay(part: Part, points: np.ndarray, normals: np.ndarray, most: float) -> tuple[np.ndarray, np.ndarray]:
-    """Lay discs on a surface along its edges, as training does: frames (M, 3, 3), and the room (M, 2) to the edges.
+    """Lay discs on a surface along its edges, as training does: frames (M, 3, 3), and distances (M, 2) to the edges.
 
-    The columns of a frame are two tangents and the normal. The room is how far the surface goes on both ways along
+    The columns of a frame are two tangents and the normal. A distance is how far the surface goes on both ways along
     a tangent, `most` metres at most.
     """
     level = np.cross(part.rotation[:, 2], normals)
     level[np.abs(normals @ part.rotation[:, 2]) > 0.99] = part.rotation[:, 0]
     level /= np.linalg.norm(level, axis=1, keepdims=True)
     frames = np.stack([level, np.cross(normals, level), normals], axis=-1)
-    room = np.full((len(points), 2), 0.2 * most)
+    to_edge = np.full((len(points), 2), 0.2 * most)
     for axis in (0, 1):
         goes_on = np.ones(len(points), bool)
         for step in (0.4 * most, 0.7 * most, most):
             for way in (step, -step):
                 goes_on &= part.contains(points + way * frames[..., axis] - 0.002 * normals)
-            room[goes_on, axis] = step
-    return frames, room
+            to_edge[goes_on, axis] = step
+    return frames, to_edge
 
 
 def _thin(points: np.ndarray, distance: float) -> np.ndarray:
-    """Choose points (M, 3), (M,) bool, none of which are nearer to each other; the earlier of two goes first."""
+    """Choose points (M, 3), no two of them nearer than a distance, (M,) bool; of two that are, the earlier stays."""
     first, second = cKDTree(points).query_pairs(distance, output_type="ndarray").T
     undecided, chosen = np.ones(len(points), bool), np.zeros(len(points), bool)
     while undecided.any():
@@ -206,7 +206,7 @@ def _thin(points: np.ndarray, distance: float) -> np.ndarray:
     return chosen
 
 
-def _float(rng: np.random.Generator) -> tuple[np.ndarray, ...]:
+def _floaters(rng: np.random.Generator) -> tuple[np.ndarray, ...]:
     """Pale Gaussians in the air around the table."""
     n = _NUM_FLOATERS
     means = rng.uniform((-0.9, -0.8, 0.2), (0.9, 0.8, 1.4), (n, 3))

@@ -88,7 +88,7 @@ def write_classes(
 ) -> dict[int, Path]:
     """Write the files of `export_classes` into a folder of a run with this id, with these meshes to collide with.
 
-    Gaussians are written in their order, or in another one.
+    Gaussians are written in the order of the scene, or in another `order`.
     """
     confidence, names = segmentation.confidence, segmentation.class_names
     order = np.arange(len(scene)) if order is None else order
@@ -120,9 +120,9 @@ def write_selection(
 ) -> None:
     """Write some Gaussians of a scene as one file, in which USD keeps the classes of these labels apart.
 
-    Meshes to collide with go into the USD, or beside another file, as `<its stem>_<id>_<name>.obj`, where those of
-    other classes that an earlier call wrote go. If anything cannot be written, all files are as they were. Raises
-    what `gsseg_core.scene.scene_writers.write_scene` does, and `EmptySceneError` where none is chosen.
+    Meshes to collide with go into the USD, or beside another file, as `<its stem>_<id>_<name>.obj`; those that an
+    earlier call wrote there for other classes are removed. If anything cannot be written, all files are as they were.
+    Raises what `gsseg_core.scene.scene_writers.write_scene` does, and `EmptySceneError` where none is chosen.
     """
     part = scene.subset(chosen)
     if not SCENE_WRITERS[scene_format].together:
@@ -168,7 +168,7 @@ def _objects(
 
 
 def class_paths(segmentation: Segmentation, folder: Path, scene_format: str) -> dict[int, Path]:
-    """Which file `write_classes` writes for each class that has Gaussians."""
+    """File that `write_classes` writes for each class that has Gaussians."""
     names, present = segmentation.class_names, np.flatnonzero(segmentation.counts()).tolist()
     return {k: folder / class_file_name(k, names[k], scene_format) for k in present}
 
@@ -207,21 +207,21 @@ def _with_confidence(
     label: int,
     confidence: np.ndarray,  # (N,)
 ) -> tuple[np.dtype[Any], Iterator[np.ndarray]]:
-    """Take some of the vertices with properties `label` (int32) and `confidence`; earlier ones go: what kind, in parts.
+    """Add the properties `label` (int32) and `confidence` to some of the vertices: their dtype, and they in parts.
 
-    A part is to be written before the next one is asked for.
+    Earlier properties of these names go. A part must be written before the next one is asked for.
     """
     names = [name for name in vertices.dtype.names or () if name not in ("label", "confidence")]
     kept = repack_fields(vertices[:0][names])
-    kind = np.dtype([*kept.dtype.descr, ("label", "<i4"), ("confidence", "<f4")])
+    dtype = np.dtype([*kept.dtype.descr, ("label", "<i4"), ("confidence", "<f4")])
     as_numbers = kept.itemsize == vertices.itemsize and kept.itemsize % 4 == 0 and vertices.flags.c_contiguous
 
     def parts() -> Iterator[np.ndarray]:
-        room = np.empty(min(len(ids), _PART), kind)
+        buffer = np.empty(min(len(ids), _PART), dtype)
         for first in range(0, len(ids), _PART):
             some = ids[first : first + _PART]
-            out = room[: len(some)]
-            if as_numbers:  # That need not be any: they are only copied.
+            out = buffer[: len(some)]
+            if as_numbers:  # Four bytes at a time are only copied, whatever they stand for.
                 into, table = (array.view(np.float32).reshape(len(array), -1) for array in (out, vertices))
                 take_rows_into(into, table, some)
             else:  # As bytes: property by property takes several times as long.
@@ -231,4 +231,4 @@ def _with_confidence(
             out["label"], out["confidence"] = label, confidence[some]
             yield out
 
-    return kind, parts()
+    return dtype, parts()

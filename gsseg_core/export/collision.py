@@ -1,7 +1,7 @@
 """Meshes to collide with: what a simulator takes for the solid shape of an object.
 
-Both begin with the object's opaque Gaussians, without floaters as `gsseg_core.objects.oriented_boxes` finds them, each
-an ellipsoid of one standard deviation.
+All three kinds are made from the object's opaque Gaussians, without floaters as `gsseg_core.objects.oriented_boxes`
+finds them, each an ellipsoid of one standard deviation.
 
 - The hull is the convex hull of the ends of their axes.
 - The surface is watertight, follows hollows, and has no cavity. The ellipsoids fill voxels; gaps between these are
@@ -29,8 +29,8 @@ VOXELS = 64  # along the longest side of the object
 _MARGIN = 4  # voxels around the ellipsoids, for closing and smoothing
 _CLOSED = 2  # voxels to either side, by which what is filled is dilated to close gaps, and then eroded
 _SAMPLES = 128  # points of an ellipsoid, by which it fills voxels
-_AT_ONCE = 1 << 14  # so many ellipsoids at a time, to keep memory small
-_ROOM = 16  # voxels around a Poisson surface, whose grid goes on with its other side
+_AT_ONCE = 1 << 14  # ellipsoids at a time, to keep memory small
+_POISSON_MARGIN = 16  # voxels around a Poisson surface, whose grid is periodic
 
 
 def check_collision(kind: str | None) -> None:
@@ -48,7 +48,7 @@ def check_collision(kind: str | None) -> None:
 
 def collision_meshes(
     scene: GaussianScene,
-    labels: npt.NDArray[np.integer],  # (N,): the object of each Gaussian; what is not above 0 is of none
+    labels: npt.NDArray[np.integer],  # (N,): the object of each Gaussian; 0 and below for none
     confidence: npt.NDArray[np.floating],  # (N,)
     kind: str | None,
 ) -> dict[int, TriangleMesh]:
@@ -109,7 +109,7 @@ def _surface(solid: Ellipsoids) -> TriangleMesh | None:
 
 def _poisson(solid: Ellipsoids) -> TriangleMesh | None:
     """Poisson surface of ellipsoids, and where they have no inside, the surface around them."""
-    voxels = _filled(solid, _ROOM)
+    voxels = _filled(solid, _POISSON_MARGIN)
     mesh = None if voxels is None else poisson_surface(solid, voxels)
     return mesh or _surface(solid)
 
@@ -131,7 +131,7 @@ def _filled(solid: Ellipsoids, margin: int = _MARGIN) -> Voxels | None:
 
 
 def _ball(count: int) -> npt.NDArray[np.float32]:
-    """Points (count, 3) spread evenly over the unit ball: directions that are, at radii in a fixed random order."""
+    """Points (count, 3) spread evenly over the unit ball: even directions, with even radii in a fixed random order."""
     radius = (np.random.default_rng(0).permutation(np.arange(count) + 0.5) / count) ** (1 / 3)
     return (sphere(count) * radius[:, None]).astype(np.float32)
 

@@ -18,7 +18,7 @@ PAPER, INK, FAINT_INK = (255, 255, 255), (32, 34, 38), (128, 131, 138)
 FILL = 0.55  # share of a label's colour in an overlaid pixel
 CELL_PX = 480  # longest side of the pictures of a contact sheet, which is looked at as a whole
 LEGEND_ROWS = 24  # lines in a column of a legend, at most
-_LONGEST = 400  # characters of a name that are ever looked at; no picture has room for more
+_LONGEST = 400  # characters of a name that are drawn at most; no picture is wide enough for more
 
 
 @lru_cache(maxsize=8)
@@ -90,9 +90,9 @@ def _tinted(image: np.ndarray, labels: np.ndarray, tints: np.ndarray, lines: np.
 
 
 def shown_at(px: int, image: np.ndarray, *labels: np.ndarray) -> tuple[np.ndarray, ...]:
-    """Thin out a picture (H, W, 3) uint8 and label maps of its size that are shown with at most so many px a side.
+    """Reduce a picture (H, W, 3) uint8, and label maps of its size, by a whole factor to no less than `px` a side.
 
-    What is left has at least that many, so that a line drawn on it is still seen.
+    So a line that is drawn on it is still seen when it is shown with `px` a side at most.
     """
     step = max(image.shape[:2]) // px
     if step < 2:
@@ -176,7 +176,7 @@ def shrunk(image: np.ndarray, px: int) -> np.ndarray:  # (H, W, 3) uint8
 
 
 def _shorten(text: str, font: ImageFont.FreeTypeFont | ImageFont.ImageFont, width: float) -> str:
-    """As much of a text as fits into a width in px, with an ellipsis where it was cut."""
+    """Cut a text so that it fits into a width in px, with an ellipsis where it was cut."""
     text = "".join("\ufffd" if ord(c) < 32 or 0xD800 <= ord(c) < 0xE000 else c for c in text[:_LONGEST])
     if font.getlength(text) <= width:
         return text

@@ -17,24 +17,24 @@ import numpy.typing as npt
 from gsseg_core.scene.triangle_mesh import TriangleMesh
 
 _DIRECTIONS = 96  # from which Gaussians are looked at
-_PIXEL, _BEHIND = 1.5, 2.0  # voxels: side of a pixel of such a look; depth behind the front that still counts as seen
+_PIXEL, _BEHIND = 1.5, 2.0  # voxels: side of a pixel of these looks; depth behind the front that still counts as seen
 _THINNEST = 1e-2  # of the longest half axis: shorter ones turn normals no further
 _DISC, _RADIUS = 32, 0.7  # samples of a Gaussian's disc; its radius, of the ellipse's: about half the area
 _SMOOTH = 1.0  # voxels, standard deviation by which normals are smoothed
 _DENSITY = 2.0  # voxels, standard deviation over which the area of discs is added up, for all to weigh the same
-_APART = 1e-2  # of the range of values: no voxel is nearer to the level
-_HELD = 0.5  # share of the Gaussians that a surface holds, or it is none of theirs
+_APART = 1e-2  # of the range of values: no voxel's value is nearer to the level
+_HELD = 0.5  # least share of the Gaussians inside a surface; one with fewer is not theirs
 
 
 class Ellipsoids(NamedTuple):
-    """What an object is taken for: an ellipsoid of one standard deviation for each of its Gaussians."""
+    """The Gaussians of an object as ellipsoids of one standard deviation."""
 
     means: npt.NDArray[np.float32]  # (M, 3)
     half_axes: npt.NDArray[np.float32]  # (M, 3, 3): one in each column
 
 
 class Voxels(NamedTuple):
-    """What ellipsoids fill: middle of voxel i is low + (i - margin + 0.5) * size."""
+    """Voxels that ellipsoids fill; the middle of voxel i is low + (i - margin + 0.5) * size."""
 
     filled: npt.NDArray[np.bool_]  # (X, Y, Z)
     low: npt.NDArray[np.float32]  # (3,)
@@ -94,7 +94,7 @@ def poisson_surface(ellipsoids: Ellipsoids, voxels: Voxels) -> TriangleMesh | No
 
 
 def _normals(ellipsoids: Ellipsoids, voxels: Voxels) -> npt.NDArray[np.float64]:
-    """Find unit normals (M, 3), outwards; 0 of a Gaussian that is seen from nowhere."""
+    """Find unit normals (M, 3), outwards; 0 for a Gaussian that is seen from nowhere."""
     means, half_axes = ellipsoids
     solid = (np.argwhere(voxels.filled) - voxels.margin + 0.5) * voxels.size + voxels.low
     cell, free = _PIXEL * voxels.size, np.zeros(means.shape)
@@ -115,7 +115,7 @@ def _normals(ellipsoids: Ellipsoids, voxels: Voxels) -> npt.NDArray[np.float64]:
 
 
 def _potential(field: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:  # (3, X, Y, Z)
-    """Find the function (X, Y, Z) whose gradient is nearest to the field turned round, both smoothed."""
+    """Find the function (X, Y, Z) whose gradient is nearest to minus the field, both smoothed."""
     from scipy import fft
 
     shape = field.shape[1:]

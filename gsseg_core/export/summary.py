@@ -30,10 +30,7 @@ PACKAGES = ("gsseg", "numpy", "scipy", "numba")  # those whose versions a report
 
 @dataclass(frozen=True)
 class RunSettings:
-    """All that determines a run; its fields are `settings` in `report.json`.
-
-    Others are what `gsseg_core.pipeline.segment` takes.
-    """
+    """All that determines a run, as `gsseg_core.pipeline.segment` takes it; `settings` in `report.json`."""
 
     learner: str
     labels: str
@@ -42,7 +39,7 @@ class RunSettings:
     memory_budget: int
     seed: int
     scheduler: str | None
-    ids: str | None  # None until the masks were opened, if they are to tell
+    ids: str | None  # None before the masks are opened, where they decide
     refine: RefineSettings
     graph: GraphSettings | None  # None where probabilities do not spread along one
     granularity: float | None = None
@@ -63,7 +60,7 @@ class RunSettings:
         ]  # fmt: skip
 
     def check(self) -> None:
-        """Raise `SettingsError` where they do not go together."""
+        """Raise `SettingsError` where one is unusable, or two contradict each other."""
         check_learner(self.learner, self.scheduler)
         check_seed(self.seed)
         if self.ids not in (*IDS, None):
@@ -103,11 +100,11 @@ class RunReport:
     versions: Mapping[str, str]  # of each package that it ran on
     run: str | None = None  # id of the run
     calibration: Mapping[str, Any] | None = None  # the temperature and what it was fitted to
-    ids: Mapping[str, Any] | None = None  # objects that ids which are a view's own were found to be
+    ids: Mapping[str, Any] | None = None  # how objects were found, where ids hold in their own view only
     prepared_views: Mapping[str, int] | None = None  # bytes in memory and in a temporary file, and the budget
     masks: Mapping[str, Any] | None = None  # those that another program wrote, or that were scaled
     page: str | None = None  # file of the report page
-    frame: Mapping[str, Any] | None = None  # how well the cameras fit the scene, and what was done to that end
+    frame: Mapping[str, Any] | None = None  # how well the cameras fit the scene, and how they were moved
 
     @classmethod
     def of(
@@ -120,9 +117,9 @@ class RunReport:
         digest: str | None = None,
         **others: Any,
     ) -> RunReport:
-        """Report a segmentation of a scene, whose file has another digest if its order is another; `others` are fields.
+        """Report a segmentation of a scene: `files` and `meshes` are those of each class, `others` all other fields.
 
-        `files` and `meshes` are the file of each class, and of the mesh to collide with it, where there is one.
+        `digest` is that of the scene's file, where Gaussians have another order there.
         """
         return cls(
             scene={"path": str(scene.path), "gaussians": len(scene), "digest": digest or scene.digest},
@@ -133,7 +130,7 @@ class RunReport:
         )
 
     def as_dict(self) -> dict[str, Any]:
-        """Give the content of `report.json`; what a run does not have is left out."""
+        """Give the content of `report.json`, without fields that are None."""
         seconds = {name: round(value, 3) for name, value in self.seconds.items()}
         return {name: value for name, value in {**vars(self), "seconds": seconds}.items() if value is not None}
 

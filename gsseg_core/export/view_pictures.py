@@ -32,7 +32,7 @@ def view_file_name(name: str, prefix: str = "") -> str:
     safe = re.sub(r"[\x00-\x1f\x7f/\ud800-\udfff]", "_", name)
     room = _LONGEST_NAME - len(f"{prefix}.png")
     if safe != name or len(safe.encode()) > room:
-        # What tells it from others that would be cut to the same.
+        # Two names may be cut to the same; the digest tells them apart.
         digest = hashlib.sha256(name.encode("utf-8", "surrogatepass")).hexdigest()[:8]
         safe = safe.encode()[: room - 9].decode(errors="ignore") + f"-{digest}"
     return f"{prefix}{safe}.png"
@@ -75,7 +75,7 @@ def draw_views(
     yield from several_at_once(draw, views, device)
 
 
-def look_at(
+def look_and_draw(
     scene: GaussianScene,
     segmentation: Segmentation,
     asked: Collection[str],
@@ -83,9 +83,9 @@ def look_at(
     device: str,
     view: View,
 ) -> Silhouette:
-    """Render what a view shows, to carve objects by; draw it into `drawn` on the way if its name is among `asked`.
+    """Render the silhouettes of a view, to carve objects by; if its name is in `asked`, also put a picture in `drawn`.
 
-    What is drawn is as large as the view.
+    A view that is drawn is rendered at its full size.
     """
     pictured = view.name in asked
     operator = make_operator(scene, view.camera if pictured else looked_from(view.camera), device)
