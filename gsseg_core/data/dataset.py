@@ -20,7 +20,7 @@ from gsseg_core.data.mask_formats.masks import MaskSet
 from gsseg_core.data.mask_formats.place import SUPERVISES, possible_stems, view_of
 from gsseg_core.data.mask_formats.table import LABEL_IMAGES, open_masks
 from gsseg_core.data.view import View
-from gsseg_core.errors import ClassesFileError, SettingsError, SplitFileError
+from gsseg_core.errors import ClassesFileError, GssegError, MaskFormatError, SettingsError, SplitFileError
 from gsseg_core.files.input_files import READABLE_IMAGES, is_there, list_below, list_folder
 from gsseg_core.files.json_files import read_object
 from gsseg_core.scene.camera import Camera
@@ -57,7 +57,7 @@ class Dataset:
     CameraFileError, PoseError, IntrinsicsError, ClassesFileError, SplitFileError, SupervisesFileError
         A file is missing or broken. A mask that is missing is no error here.
     MaskFormatError
-        A view has masks of two kinds, or masks of another program cannot be read.
+        A view has masks of two kinds, masks of another program cannot be read, or the folder of masks or photos cannot.
     LabelMapError, SettingsError
         The label map is broken, or the masks' ids hold in their own view only.
     PathNotAllowedError
@@ -90,10 +90,11 @@ class Dataset:
             self._apply_label_map(label_map)
         self._split = _read_split(self.root / "split.json", self.cameras, self._within)
 
-    def _photos(self, listed: Callable[[Path, Path | None], list[Path]]) -> dict[str, Path]:
+    def _photos(self, listed: Callable[[Path, type[GssegError], Path | None], list[Path]]) -> dict[str, Path]:
         """Find photos by the names of images, among those that are listed in `images`."""
         folder, names = self.root / "images", {camera.image for camera in self.cameras}
-        photos = [path for path in listed(folder, self._within) if path.suffix.lower() in READABLE_IMAGES]
+        found = listed(folder, MaskFormatError, self._within)
+        photos = [path for path in found if path.suffix.lower() in READABLE_IMAGES]
         stems = ((possible_stems(str(path.relative_to(folder).with_suffix(""))), path) for path in photos)
         return {name: path for stems_of_path, path in stems for name in stems_of_path if name in names}
 

@@ -36,7 +36,7 @@ def mask_files(folder: Path, stems: Iterable[str], within: Path | None = None) -
     """
     found: dict[str, Path] = {}
     wanted, others = set(stems), []
-    for path in list_folder(folder, within):
+    for path in list_folder(folder, MaskFormatError, within):
         is_folder = path.is_dir()
         stem = composed(path.name if is_folder else path.stem)
         if not is_folder and path.suffix.lower() not in (".png", ".npz"):
@@ -62,7 +62,7 @@ def masks_below(folder: Path, stems: Iterable[str], within: Path | None = None) 
     found = mask_files(folder, wanted, within)
     if found:
         return found
-    for path in list_below(folder, within):
+    for path in list_below(folder, MaskFormatError, within):
         view = view_of(str(path.relative_to(folder)), wanted) if path.suffix.lower() in (".png", ".npz") else None
         if view in found:
             return {}
@@ -157,7 +157,7 @@ def _check_claims(path: Path, arrays: NpzArrays, class_names: Mapping[int, str] 
 def _read_detections(folder: Path, camera: Camera | None, within: Path | None) -> SeenLabels:
     detections: dict[int, npt.NDArray[np.generic]] = {}
     unknown = None
-    for path in list_folder(folder, within):
+    for path in list_folder(folder, MaskFormatError, within):
         if path.suffix.lower() not in DETECTIONS:
             continue
         if path.stem == _UNKNOWN:

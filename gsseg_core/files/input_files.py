@@ -102,23 +102,29 @@ def require_below(target: str, path: str | os.PathLike[str], within: Path) -> No
         raise PathNotAllowedError(f"{path}: leads out of {within}; expected what lies below it, links followed")
 
 
-def list_folder(folder: Path, within: Path | None) -> list[Path]:
-    """List what is in a folder, sorted; nothing if there is no folder. With `within`, it must lie below that."""
-    if not folder.is_dir():
-        return []
-    if within is not None:
-        require_below(os.path.realpath(folder), folder, within)
-    return sorted(folder.iterdir())
+def list_folder(folder: Path, error: type[GssegError], within: Path | None) -> list[Path]:
+    """List what is in a folder, sorted; nothing if there is no folder. With `within`, it must lie below that.
+
+    Raises `error` where it cannot be read.
+    """
+    try:
+        if not folder.is_dir():
+            return []
+        if within is not None:
+            require_below(os.path.realpath(folder), folder, within)
+        return sorted(folder.iterdir())
+    except OSError as cause:
+        raise error(f"{folder}: cannot be read ({reason(cause)}); expected a folder that can be listed") from cause
 
 
-def list_below(folder: Path, within: Path | None, depth: int = 4) -> list[Path]:
+def list_below(folder: Path, error: type[GssegError], within: Path | None, depth: int = 4) -> list[Path]:
     """List the files of a folder and, `depth` levels down, of its folders that are not hidden, by `list_folder`."""
     files: list[Path] = []
-    for path in list_folder(folder, within):
+    for path in list_folder(folder, error, within):
         if not path.is_dir():
             files.append(path)
         elif depth and not path.name.startswith("."):
-            files += list_below(path, within, depth - 1)
+            files += list_below(path, error, within, depth - 1)
     return files
 
 
@@ -133,7 +139,7 @@ def is_there(path: Path, error: type[GssegError]) -> bool:
         if path.is_symlink():
             raise error(f"{path}: is a link to {os.readlink(path)}, which does not exist; expected a file") from cause
         return False
-    except OSError as cause:
+    except (OSError, ValueError) as cause:  # ValueError: a NUL in the path
         raise error(f"{path}: cannot be read ({reason(cause)})") from cause
     if not stat.S_ISREG(mode):
         raise error(f"{path}: is {_KINDS.get(stat.S_IFMT(mode), 'no file')}; expected a regular file, or nothing")

@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import shlex
 from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -94,8 +95,9 @@ def find_format(path: Path, within: Path | None = None) -> SceneFormat | None:
     """
     name = path.name.lower()
     suited = [known for known in SCENE_FORMATS if name.endswith(known.suffixes)]
-    if path.is_dir():
-        return next((known for known in SCENE_FORMATS if known.name == "SOG" and (path / "meta.json").exists()), None)
+    if os.path.isdir(path):  # Unlike `Path.is_dir`, false where one may not even look.
+        is_sog = os.path.exists(path / "meta.json")
+        return next((known for known in SCENE_FORMATS if known.name == "SOG" and is_sog), None)
     try:
         with open_input(path, within) as file:
             head = file.read(_HEAD)
@@ -123,21 +125,24 @@ def read_scene(path: str | os.PathLike[str], within: Path | None = None) -> Read
         if isinstance(error, OSError):
             what = f"{path}: cannot be read ({reason(error)}); expected a {scene_format.name}"
         formats = ", ".join(f"{known.name} ({known.looked_for})" for known in SCENE_FORMATS)
-        known = "" if suited or path.is_dir() else f"; gsseg reads {formats}"
+        known = "" if suited or os.path.isdir(path) else f"; gsseg reads {formats}"
         hint = scene_hint(path) if within is None else ""  # It looks around, wherever links lead.
         raise SceneFileError(f"{what}{known}{hint}") from error
 
 
 def scene_hint(path: Path) -> str:
-    """Hint at where a scene lies, if a folder or nothing was found in its place."""
-    if path.is_dir():
-        # Trainers write point_cloud/iteration_30000/point_cloud.ply; the one of most steps is wanted.
-        trained = sorted(path.glob("point_cloud/iteration_*"), key=lambda folder: (len(folder.name), folder.name))
-        found = [scene for folder in (*trained, path) for scene in _scenes_in(folder)]
-        return f"; it is a folder: type {shlex.quote(str(found[-1]))}" if found else "; it is a folder without a scene"
-    if not path.exists():
-        near = _scenes_in(path.parent)
-        return f"; found {', '.join(file.name for file in near[:4])} in {path.parent}" if near else ""
+    """Hint at where a scene lies, if a folder or nothing was found in its place; "" where one may not look."""
+    with suppress(OSError):
+        if path.is_dir():
+            # Trainers write point_cloud/iteration_30000/point_cloud.ply; the one of most steps is wanted.
+            trained = sorted(path.glob("point_cloud/iteration_*"), key=lambda folder: (len(folder.name), folder.name))
+            found = [scene for folder in (*trained, path) for scene in _scenes_in(folder)]
+            if not found:
+                return "; it is a folder without a scene"
+            return f"; it is a folder: type {shlex.quote(str(found[-1]))}"
+        if not path.exists():
+            near = _scenes_in(path.parent)
+            return f"; found {', '.join(file.name for file in near[:4])} in {path.parent}" if near else ""
     return ""
 
 

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import errno
 import json
+from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
@@ -129,6 +131,30 @@ def test_another_folder_of_labels_can_be_named(tmp_path: Path) -> None:
     assert not a.has_mask
     np.testing.assert_array_equal(c.read_labels(), LABELS + 1)
     assert not any(view.has_mask for view in Dataset(root, labels="elsewhere").views())
+
+
+@pytest.mark.parametrize("unreadable", ["labels", "images"])
+def test_a_folder_that_cannot_be_listed_is_refused_by_its_name(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, unreadable: str
+) -> None:
+    make_dataset(tmp_path)
+    (tmp_path / "images").mkdir(exist_ok=True)
+    listed = Path.iterdir
+
+    def denied(path: Path) -> Iterator[Path]:
+        if path.name == unreadable:
+            raise PermissionError(errno.EACCES, "Permission denied", str(path))
+        return listed(path)
+
+    monkeypatch.setattr(Path, "iterdir", denied)
+    with pytest.raises(MaskFormatError, match=rf"{unreadable}: cannot be read \(Permission denied\)"):
+        Dataset(tmp_path)
+
+
+def test_masks_that_the_system_does_not_let_one_look_for_are_refused(tmp_path: Path) -> None:
+    make_dataset(tmp_path)
+    with pytest.raises(MaskFormatError, match=r"cannot be read \(File name too long\)"):
+        Dataset(tmp_path, "a" * 300)
 
 
 @pytest.mark.parametrize("factor", [2, 3, 7])

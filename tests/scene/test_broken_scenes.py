@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import gzip
 import pickle
 import random
@@ -32,6 +33,20 @@ def little_memory(most: int = 80 << 20) -> Iterator[None]:
         assert tracemalloc.get_traced_memory()[1] < most
     finally:
         tracemalloc.stop()
+
+
+@pytest.mark.parametrize("name", [f"{'a' * 300}.ply", "a" * 300])
+def test_a_scene_that_the_system_does_not_let_one_look_for_is_refused(tmp_path: Path, name: str) -> None:
+    refuse(tmp_path / name, "cannot be read .*File name too long")
+
+
+def test_a_folder_that_cannot_be_listed_is_refused_as_a_scene(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(Path, "iterdir", denied)
+    refuse(tmp_path, r"is a folder\); expected a 3DGS PLY$")
+
+
+def denied(path: Path) -> Iterator[Path]:
+    raise PermissionError(errno.EACCES, "Permission denied", str(path))
 
 
 def refuse(path: Path, match: str) -> None:

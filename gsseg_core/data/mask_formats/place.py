@@ -60,7 +60,7 @@ class Place:
     @cached_property
     def entries(self) -> list[Path]:
         """Files and folders in it, sorted, without gsseg's own `supervises.json`; none if it is a file."""
-        return [path for path in list_folder(self.path, self.within) if path.name != SUPERVISES]
+        return [path for path in list_folder(self.path, MaskFormatError, self.within) if path.name != SUPERVISES]
 
     @property
     def folders(self) -> list[Path]:

@@ -52,7 +52,7 @@ def _objects(place: Place) -> dict[int, dict[str, Path]]:
     """Masks by view, by object; without objects that no view shows."""
     found = {}
     for folder in place.folders:
-        files = (path for path in list_folder(folder, place.within) if path.suffix.lower() == ".png")
+        files = (path for path in list_folder(folder, MaskFormatError, place.within) if path.suffix.lower() == ".png")
         if masks := place.views((path.name, path) for path in files):
             found[int(folder.name)] = masks
     return found

@@ -24,7 +24,7 @@ from gsseg_core.data.mask_formats.sam import METADATA, is_sam_folder, is_sam_jso
 from gsseg_core.data.mask_formats.sam2 import is_sam2, read_sam2
 from gsseg_core.data.mask_formats.yolo import is_yolo, read_yolo
 from gsseg_core.errors import MaskFormatError
-from gsseg_core.files.input_files import list_folder
+from gsseg_core.files.input_files import list_folder, reason
 from gsseg_core.text import quoted
 
 
@@ -94,10 +94,10 @@ def open_masks(path: Path, stems: Iterable[str], within: Path | None = None) -> 
     Raises `MaskFormatError` where they are of no known format, or may be of several, are broken, or of no view;
     `PathNotAllowedError` where they lie outside `within`; `SettingsError` where a library is needed and not installed.
     """
-    if not path.exists():
-        return None
     place = Place(path, frozenset(stems), within)
     try:
+        if not path.exists():
+            return None
         found = [known for known in MASK_FORMATS if known.recognise(place)]
         names = [known.name for known in found]
         if found and "EISeg" not in names and _has_own(place):
@@ -112,6 +112,8 @@ def open_masks(path: Path, stems: Iterable[str], within: Path | None = None) -> 
         masks = found[0].read(place) if found else None
     except RecursionError as cause:
         raise MaskFormatError(f"{path}: is nested too deep; expected masks") from cause
+    except OSError as cause:
+        raise MaskFormatError(f"{path}: cannot be read ({reason(cause)}); expected masks") from cause
     if masks is not None and not masks.views:
         names_of_views = ", ".join(map(quoted, sorted(place.stems)[:3]))
         others = f" but of {quoted(place.unmatched[-1])}" if place.unmatched else ""
@@ -142,7 +144,8 @@ def _has_own(place: Place) -> bool:
 
 def _is_own(path: Path, place: Place) -> bool:
     if path.is_dir():
-        ids = [file.stem for file in list_folder(path, place.within) if file.suffix.lower() in DETECTIONS]
+        files = list_folder(path, MaskFormatError, place.within)
+        ids = [file.stem for file in files if file.suffix.lower() in DETECTIONS]
         return not (path / METADATA).exists() and any(re.fullmatch(CLASS_ID, stem) for stem in ids)
     with suppress(MaskFormatError):
         return path.suffix.lower() == ".npz" or bool(mask_header(path, place.within))
