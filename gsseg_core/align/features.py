@@ -121,7 +121,7 @@ def matches(photo: Features, rendering: Features, ratio: float, within_px: float
 
 
 def _shrunk(camera: Camera, longer_px: int) -> Camera:
-    """Shrink a camera's picture so that its longer side is at most so many px."""
+    """Shrink a camera's picture so that its longer side is at most `longer_px`."""
     scale = min(1.0, longer_px / max(camera.width, camera.height))
     width, height = (max(round(scale * side), 1) for side in (camera.width, camera.height))
     return resized_camera(camera, width, height)

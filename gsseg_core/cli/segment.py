@@ -92,7 +92,7 @@ def run(options: argparse.Namespace) -> int:
     from gsseg_core.text import segment_summary
 
     agreement = report["frame"]["agreement"]
-    if agreement and not agreement["agrees"]:  # None, too, where nobody can tell.
+    if agreement and not agreement["agrees"]:  # None where it is undecided.
         looks = "does not look" if agreement["agrees"] is False else "hardly looks"
         note(
             f"the scene {looks} as the {agreement['compared']} do from these cameras: the two may be in different "

@@ -43,7 +43,7 @@ def flush() -> None:
 
 
 def note(text: str) -> None:
-    """Write a line for people to standard error; where that cannot be written, nobody reads it."""
+    """Write a line for people to standard error, or nowhere if that cannot be written."""
     try:
         print(f"gsseg: {one_line(text)}", file=sys.stderr, flush=True)
     except OSError:

@@ -228,7 +228,7 @@ class View:
             return None
         try:
             header = mask_header(self.mask_path, self.within)
-        except GssegError:  # Told to those who read it.
+        except GssegError:  # Reading the mask says what is wrong.
             return None
         return header.width, header.height
 

@@ -9,7 +9,7 @@ import numpy as np
 from scipy import ndimage
 
 MISSED, SWAPPED = 0.15, 0.10  # probabilities that an object is missed, and that it gets the label of another one
-EDGE_PX = 3  # the outline of each object moves in or out by 0 to so many whole px, all as likely
+EDGE_PX = 3  # the outline of each object moves in or out by a whole number of px up to this, all as likely
 STREAMS = 4  # of random numbers for each view, so that one kind of error leaves the draws of the others alone
 
 
@@ -38,7 +38,7 @@ def move_edges(labels: np.ndarray, rng: np.random.Generator, most: int) -> np.nd
 
 
 def resize(labels: np.ndarray, label: int, shift: int) -> None:
-    """Grow an object of a map (H, W) in place, by so many px all around, or shrink it if `shift` is negative."""
+    """Grow an object of a map (H, W) in place by `shift` px all around, or shrink it if that is negative."""
     mask = labels == label
     if not shift or not mask.any():  # another object may have grown over it
         return

@@ -103,7 +103,7 @@ def shown_at(px: int, image: np.ndarray, *labels: np.ndarray) -> tuple[np.ndarra
 
 
 def contact_sheet(images: Sequence[np.ndarray], captions: Sequence[str], columns: int) -> np.ndarray:
-    """Lay pictures out in rows of so many, (H, W, 3) uint8 each, at least one, with their captions below.
+    """Lay pictures, (H, W, 3) uint8 each, at least one, out in rows of `columns`, with their captions below.
 
     They are shrunk to `CELL_PX` a side at most; smaller ones are centred in cells of the largest one's size.
     """
@@ -167,7 +167,7 @@ def outline(labels: np.ndarray) -> np.ndarray:
 
 
 def shrunk(image: np.ndarray, px: int) -> np.ndarray:  # (H, W, 3) uint8
-    """Shrink a picture so that neither side is longer than so many px."""
+    """Shrink a picture so that neither side is longer than `px`."""
     if max(image.shape[:2]) <= px:
         return image
     picture = Image.fromarray(image)

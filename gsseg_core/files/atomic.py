@@ -73,7 +73,7 @@ def check_replaceable(path: Path, what: str, is_one: bool) -> None:
 
 
 def try_lock(file: int) -> bool | None:
-    """Lock an open file for this process if nobody has; None where the file system has no locks.
+    """Lock an open file for this process; False if another has locked it, None where the file system has no locks.
 
     The lock ends with the process, however that ends.
     """
@@ -124,7 +124,7 @@ def _locked_file(folder: Path, suffix: str) -> tuple[Path, int]:
     while True:
         path = folder / f".gsseg-{secrets.token_hex(6)}{suffix}"
         file = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC, 0o666)
-        # Between the two calls somebody may have taken it for a leftover.
+        # Between the two calls another process may have taken it for a leftover.
         if try_lock(file) is not False and path.exists():
             return path, file
         os.close(file)

@@ -66,7 +66,7 @@ class NpzArrays:
             )
 
     def header(self, name: str) -> Header:
-        """Read what an array claims to be; `ValueError` if there is none of this name, or it is none."""
+        """Read shape and type of an array from its header; `ValueError` if it is missing or its header broken."""
         if name not in self.names:
             raise ValueError(f"there is no array {name!r}")
         with self._archive.open(name + _SUFFIX) as member:
@@ -84,7 +84,7 @@ class NpzArrays:
         return self.read(name)
 
     def read(self, name: str) -> npt.NDArray[Any]:
-        """Read an array; whoever calls has looked at its `header`."""
+        """Read an array, whose `header` the caller has checked."""
         with self._archive.open(name + _SUFFIX) as member:
             array: npt.NDArray[Any] = np.lib.format.read_array(member, allow_pickle=False)
             if member.read(1):  # and so the checksum has been compared, too

@@ -8,7 +8,7 @@ In a folder OUT that gsseg writes, three names are its own besides the results:
 | `.gsseg-<id>/` | a run that is being written; the process that writes it holds a lock on it |
 | `.gsseg-commit.json` | the manifest to be, of a run that is the result already, but not yet moved into its places |
 
-Whoever moves files holds, for moments, a lock on OUT itself.
+A process that moves files holds a lock on OUT itself for that time.
 
 A run is written into `.gsseg-<id>/new/`. When all of it is on the disk, one rename makes its manifest
 `.gsseg-commit.json`: with that it is the result. Its files are moved into their places, those of the run before that it
@@ -212,7 +212,7 @@ def _unwritable(out: Path, error: OSError) -> WriteError:
 
 
 def _move_aside(path: Path, run_id: str) -> None:
-    """Give what somebody made or edited another name in the same folder."""
+    """Rename a file that was edited since gsseg wrote it, or is none of gsseg's, within its folder."""
     number = ""
     while os.path.lexists(aside := path.with_name(f"{path.stem[:60]}.edited-{run_id}{number}{path.suffix[:20]}")):
         number = f"-{secrets.token_hex(2)}"
@@ -261,7 +261,7 @@ def _open_folder(folder: Path) -> int:
 
 @contextlib.contextmanager
 def _locked(folder: Path) -> Iterator[None]:
-    """Keep others from moving files in a folder; where the file system has no locks, nobody is kept."""
+    """Keep other processes from moving files in a folder, if its file system has locks."""
     deadline = time.monotonic() + _PATIENCE
     try:
         lock = _open_folder(folder)

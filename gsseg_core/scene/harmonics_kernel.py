@@ -1,4 +1,4 @@
-"""Kernels of spherical harmonics, in a module of their own: whoever only reads scenes does not load numba."""
+"""Kernels of spherical harmonics, in a module of their own, so that reading a scene does not load numba."""
 
 from __future__ import annotations
 

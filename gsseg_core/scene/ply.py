@@ -127,7 +127,7 @@ def write_parts(
 ) -> None:  # fmt: skip
     """Write `count` vertices as `write_vertices` does, part by part, so that not all need to be in memory at once."""
     comments = [] if run is None else [f"gsseg_run {run}"]
-    # An array that nobody touches takes no memory.
+    # An empty array takes no memory until it is written to.
     element = plyfile.PlyElement.describe(np.empty(count, dtype), "vertex", comments=comments)
     header = plyfile.PlyData([element], byte_order="<").header
     with write_atomically(path) as temporary, open(temporary, "wb") as file:

@@ -36,7 +36,7 @@ def read_mip_splatting(path: Path, within: Path | None = None) -> ReadScene:
 
     A Gaussian of scales s and a filter of size f is that of scales sqrt(s^2 + f^2), its opacity multiplied by
     sqrt(prod s^2 / prod (s^2 + f^2)): equation 9 of Yu et al., Mip-Splatting, CVPR 2024. The property `filter_3D` is
-    left out, so that nobody fuses it twice.
+    left out, so that it is not fused twice.
     """
     vertices = read_vertices(path, within)
     check_properties(vertices, SCALES + OPACITY, str(path))

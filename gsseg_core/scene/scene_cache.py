@@ -13,7 +13,7 @@ T = TypeVar("T")
 
 
 class PerScene(Generic[T]):
-    """Cache of one value per scene; whoever asks while another thread computes it waits for that one."""
+    """Cache of one value per scene; a thread that asks while another one computes it waits."""
 
     def __init__(self) -> None:
         self._known: WeakKeyDictionary[GaussianScene, T] = WeakKeyDictionary()

@@ -1,4 +1,4 @@
-"""The table of scene formats: how each is recognised, who reads it, and what it keeps of a Gaussian."""
+"""The table of scene formats: how each is recognised, what reads it, and what it keeps of a Gaussian."""
 
 from __future__ import annotations
 
@@ -84,7 +84,7 @@ SCENE_FORMATS = [
         checkpoint.is_checkpoint,
     ),
 ]  # fmt: skip
-"""All formats, the first being that of a file that nobody knows; who adds one, adds it here."""
+"""All formats, the first for a file that is of no known one; a new one is added here."""
 
 
 def find_format(path: Path, within: Path | None = None) -> SceneFormat | None:

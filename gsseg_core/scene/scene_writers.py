@@ -1,4 +1,4 @@
-"""The table of formats that scenes are written in: who writes each, and which extra that needs."""
+"""The table of formats that scenes are written in: what writes each, and which extra of gsseg it needs."""
 
 from __future__ import annotations
 

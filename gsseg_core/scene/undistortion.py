@@ -69,7 +69,7 @@ class Undistortion:
         image: npt.NDArray[np.uint8],  # (H, W, 3), of the lens
     ) -> npt.NDArray[np.uint8]:
         """Interpolate a photo: (height, width, 3), black where it does not reach; raises as `sample` does."""
-        from scipy import ndimage  # Cameras are imported by those who never see a photo.
+        from scipy import ndimage  # Slow to load, and only photos need it.
 
         self._check_size(image)
         view = np.empty((self.height, self.width, 3), np.uint8)

@@ -1,4 +1,4 @@
-"""The table of camera formats: how each is recognised in a dataset folder, and who reads it."""
+"""The table of camera formats: how each is recognised in a dataset folder, and what reads it."""
 
 from __future__ import annotations
 
@@ -55,4 +55,4 @@ CAMERA_FORMATS = [
     CameraFormat("nerfstudio", read_nerfstudio, ("transforms.json",), frame_of_training=saved_to_trained),
     CameraFormat("COLMAP", read_colmap, ("cameras.bin", "cameras.txt"), ("sparse/0", "sparse"), original_to_trained),
 ]
-"""All formats, the first that is there being read; who adds one, adds it here."""
+"""All formats; the first that a dataset has is read. A new one is added here."""

@@ -1,4 +1,4 @@
-"""The table of mask formats of other programs: how each is recognised, and who reads it.
+"""The table of mask formats of other programs: how each is recognised, and what reads it.
 
 gsseg's own masks, a label image, probabilities or detections per view, are not in it: see `data/mask_files.py`.
 """
@@ -85,7 +85,7 @@ MASK_FORMATS = [
         "those of the labels", "the last polygon",
     ),
 ]  # fmt: skip
-"""All formats; who adds one, adds it here."""
+"""All formats; a new one is added here."""
 
 
 def open_masks(path: Path, stems: Iterable[str], within: Path | None = None) -> MaskSet | None:
@@ -130,7 +130,7 @@ def known_formats() -> str:
 
 
 def _unknown(place: Place) -> Path | None:
-    """Find a file that is meant as masks: the place itself, or what a view has where there is none of gsseg's own."""
+    """Find a file of no known format that is meant as masks: the place itself, or, without gsseg's own, a view's."""
     if not place.path.is_dir():
         return place.path
     described = next(iter([*place.by_view(".json").values(), *place.by_view(".txt").values()]), None)

@@ -46,7 +46,7 @@ def write_sog(path: Path, scene: GaussianScene, run: str | None) -> None:
     meta["quats"] = {"files": ["quats.webp"]}
 
     book, codes = _coded(scene.sh[:, 0])
-    alpha = np.rint(scene.opacities * 255).clip(1, 254)  # finite logits for whoever reads it
+    alpha = np.rint(scene.opacities * 255).clip(1, 254)  # so that its logit is finite
     images["sh0.webp"] = _pixels(np.concatenate([codes, alpha[:, None]], axis=1))
     meta["sh0"] = {"codebook": book, "files": ["sh0.webp"]}
 

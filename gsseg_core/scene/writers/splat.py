@@ -15,6 +15,6 @@ def write_splat(path: Path, scene: GaussianScene, run: str | None) -> None:
     records = np.empty(len(scene), RECORD)
     records["mean"], records["scale"] = scene.means, scene.scales
     records["rgba"][:, :3] = np.rint(scene.colors() * 255)
-    records["rgba"][:, 3] = np.rint(scene.opacities * 255).clip(1, 254)  # finite logits for whoever reads it
+    records["rgba"][:, 3] = np.rint(scene.opacities * 255).clip(1, 254)  # so that its logit is finite
     records["quat"] = np.rint(scene.quats * 128 + 128).clip(0, 255)
     records.tofile(path)

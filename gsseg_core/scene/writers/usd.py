@@ -5,7 +5,7 @@ Values are activated float32, in the axes of the scene. The stage's y axis is up
     /Scene                          Xform, the default prim
     /Scene/class_1_chair            Xform, to move the object by
     /Scene/class_1_chair/splats     ParticleField3DGaussianSplat, with its class as a semantic label
-    /Scene/class_1_chair/collision  Mesh that nobody draws, with the collision schemas of UsdPhysics
+    /Scene/class_1_chair/collision  Mesh that is not drawn, with the collision schemas of UsdPhysics
 """
 
 from __future__ import annotations
