@@ -97,6 +97,7 @@ class LearnAction:
                 dataset = self._dataset(request)
         elif request.labels or request.label_map:
             raise InvalidRequestError("labels and label_map are those of a dataset; expected dataset_path beside them")
+        self._workspace.placement.finish(job.check)  # What is learnt of views stays as it is where they move.
         version = session.version
         try:
             outcome = session.learn(

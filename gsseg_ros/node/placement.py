@@ -66,6 +66,11 @@ class Placement:
             for name in waiting:
                 self._follows(session, name, moved_from)
 
+    def finish(self, check: Callable[[], object] = lambda: None) -> None:
+        """Have all views follow, one by one, others being fused in between; `check` may end it by raising something."""
+        while self._next_follows():
+            check()
+
     def forget(self) -> None:
         """Leave all views where they are, as they are replaced."""
         # Without the lock: whoever replaces the scene must not wait for a view that is being fused.
@@ -77,8 +82,7 @@ class Placement:
             threading.Thread(target=self._follow, name="placement", daemon=True).start()
 
     def _follow(self) -> None:
-        while self._next_follows():
-            pass
+        self.finish()
         self.settled()
 
     def _next_follows(self) -> bool:

@@ -267,6 +267,7 @@ class Services:
     def save_state(self, request: SaveState.Request, response: SaveState.Response) -> None:
         """Save votes, views and class probabilities."""
         path, session = self.workspace.path(request.path, STATE_FILE), self.workspace.session
+        self.workspace.placement.finish()  # Where they are in a state, views stay.
         with self.workspace.run("save_state"), pinned_folder(path.parent, self.workspace.root) as folder:
             response.num_views = session.save(folder / path.name)
             response.path, response.num_bytes = str(path), (folder / path.name).stat().st_size
@@ -289,6 +290,7 @@ class Services:
         check_format(scene_format)
         check_collision(collision)
         require_own_folder(directory, "segment")  # Before the work, and again below.
+        self.workspace.placement.finish()  # Nothing exports anew once they have followed.
         with self.workspace.run("export") as run:
             selection, refine = self._select(request, run)
             self.workspace.number(run)

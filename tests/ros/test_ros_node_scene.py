@@ -5,6 +5,7 @@ from __future__ import annotations
 import threading
 from collections.abc import Callable, Iterator
 from typing import Any
+from unittest.mock import MagicMock
 
 import numpy as np
 import pytest
@@ -12,17 +13,20 @@ from patience import PATIENCE
 from ros_fixtures import parameters_fixture, root_fixture, scene_fixture, shared_fixture  # noqa: F401
 from ros_helpers import Ros, wait_until
 from ros_node_here import NodeHere, node_here
-from ros_robot import LATCHED, SECOND, SERVICES, Robot, core_session, messages, renamed, viewpoint
+from ros_robot import IDENTITY, LATCHED, SECOND, SERVICES, Robot, core_session, messages, renamed, viewpoint
 from small_scenes import clean_views
 
 from gsseg_core.data.view import View
 from gsseg_core.scene.gaussian_scene import GaussianScene
+from gsseg_ros.frames import Similarity
 from gsseg_ros.node import inputs, segment_node
 from gsseg_ros.node.matched_subscription import MatchedSubscription
 
 pytest.importorskip("gsseg_msgs.msg", reason="gsseg_msgs is not installed")
 
+from gsseg_msgs.action import Learn
 from gsseg_msgs.msg import ObjectArray, SegmentationReport
+from rclpy.parameter import Parameter
 from sensor_msgs.msg import Image, PointCloud2
 
 CHANGES = ("load_scene", "reset", "load_state")
@@ -53,6 +57,35 @@ def joined(thread: threading.Thread) -> None:
 
 
 # Views
+
+
+@pytest.mark.parametrize("work", ["save_state", "export", "learn"])
+def test_what_is_saved_exported_or_learnt_is_of_views_that_have_all_followed_the_scene(
+    here: NodeHere, monkeypatch: pytest.MonkeyPatch, work: str
+) -> None:
+    views, found = clean_views(3), []
+    here.fuse(views)
+    workspace = here.node.workspace
+    session, method = workspace.living_session, {"save_state": "save", "export": "segmentation", "learn": "learn"}[work]
+    done = getattr(session, method)
+
+    def noted(*arguments: Any, **settings: Any) -> Any:
+        found.append([view.camera.world_to_camera for view in session.views])
+        return done(*arguments, **settings)
+
+    monkeypatch.setattr(session, method, noted)
+    monkeypatch.setattr(workspace.placement, "_begin", lambda: None)  # What follows in the background comes too late.
+    aside = [0.05, -0.02, 0.03]
+    (result,) = here.node.set_parameters([Parameter("scene_to_map.translation", value=aside)])
+    assert result.successful
+    if work == "learn":
+        goal = MagicMock(request=Learn.Goal(max_steps=1), is_cancel_requested=False)
+        assert here.node._learn._execute(goal).error_code == 0
+    else:
+        here.done(work)
+    place = Similarity.from_parameters(1.0, aside, [0.0, 0.0, 0.0, 1.0])
+    in_map = [IDENTITY.camera_in_map(view.camera.world_to_camera) for view in views]
+    np.testing.assert_allclose(found[0], [place.world_to_camera(pose) for pose in in_map], atol=1e-6)
 
 
 def test_views_of_a_saved_state_stay_when_the_stamps_of_a_new_run_repeat(
