@@ -12,6 +12,7 @@ import numpy as np
 import numpy.typing as npt
 
 from gsseg_core.errors import SettingsError
+from gsseg_core.files.limits import LIMITS
 from gsseg_core.objects.oriented_boxes import OrientedBox
 from gsseg_core.scene import similarity
 from gsseg_core.scene.camera import rigid_motion
@@ -85,11 +86,14 @@ def pose_from_parameters(
     Raises
     ------
     SettingsError
-        A number is missing, NaN or infinite, or the quaternion is zero; the message names the parameter.
+        A number is missing, NaN or infinite, the quaternion zero, or the translation too large; the message names the
+        parameter.
     """
     for part, values, size in (("translation", translation, 3), ("rotation", quaternion_xyzw, 4)):
         if len(values) != size or not np.isfinite(values).all():
             raise SettingsError(f"{name}.{part} is {list(values)}; expected {size} finite numbers")
+    if np.abs(translation).max() > LIMITS.max_value:
+        raise SettingsError(f"{name}.translation is {list(translation)}; expected metres, at most {LIMITS.max_value:g}")
     if not any(quaternion_xyzw):
         raise SettingsError(f"{name}.rotation is all zeros; expected a quaternion x y z w, [0, 0, 0, 1] for none")
     x, y, z, w = quaternion_xyzw

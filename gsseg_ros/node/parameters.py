@@ -12,8 +12,10 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 from rcl_interfaces.msg import SetParametersResult
+from rclpy.exceptions import InvalidTopicNameException
 from rclpy.node import Node
 from rclpy.parameter import Parameter
+from rclpy.validate_topic_name import validate_topic_name
 
 from gsseg_core.data.class_names import class_ids, flaw_of_class_name
 from gsseg_core.data.label_images import PER_VIEW
@@ -21,6 +23,7 @@ from gsseg_core.errors import GssegError, SettingsError
 from gsseg_core.raster.backends import rasteriser_of
 from gsseg_core.raster.depth_gating import DepthTolerance
 from gsseg_core.scene.scene_writers import check_format
+from gsseg_core.text import one_line
 from gsseg_ros.camera_infos import AUTO, RECTIFIED
 from gsseg_ros.frames import Similarity, pose_from_parameters
 from gsseg_ros.node.declarations import AT_ONCE, DECLARATIONS, OBJECTS, POSE_SOURCES
@@ -94,9 +97,13 @@ class Settings:
             check_format(self.export_format)
         except SettingsError as error:
             raise SettingsError(f"parameter export_{error}") from error
-        if len(self.cameras) > 1 and self.detections_topic.startswith("/"):
-            found = f"{self.detections_topic}, but there are {len(self.cameras)} cameras"
+        if self.cameras and self.detections_topic.startswith("/"):
+            found = f"{self.detections_topic}, but there are cameras"
             raise SettingsError(f"parameter detections_topic is {found}; expected a name below that of each camera")
+        try:
+            validate_topic_name(self.detections_topic or "none")
+        except InvalidTopicNameException as error:
+            raise SettingsError(f"parameter detections_topic: {one_line(str(error))}") from error
         if self.ids == PER_VIEW and self.label_map and not self.detections_topic:
             found = f"{self.label_map}, but with ids '{PER_VIEW}' masks have no classes"
             raise SettingsError(f"parameter label_map is {found}; expected it to be empty")
@@ -114,6 +121,11 @@ class Settings:
                 raise SettingsError(f"{found}; expected distinct names of letters, digits and single underscores")
         if not self.map_frame:
             raise SettingsError("parameter map_frame is empty; expected the name of a frame, such as 'map'")
+        for name in ("map_frame", "scene_frame"):
+            if (frame := getattr(self, name)).startswith("/"):
+                raise SettingsError(f"parameter {name} is '{frame}'; expected no slash before it, as TF takes none")
+        if self.scene_frame == self.map_frame:
+            raise SettingsError(f"parameter scene_frame is '{self.scene_frame}', as map_frame; expected another name")
         for index, flaw in enumerate(map(flaw_of_class_name, self.class_names)):
             if flaw:
                 raise SettingsError(f"parameter class_names: label {index} has the name {flaw}")
@@ -158,6 +170,13 @@ class Settings:
 def _triple(values: dict[str, Any], name: str, with_scale: bool = False) -> list[Any]:
     parts = ["translation", "rotation"]
     return [values[f"{name}.{part}"] for part in (["scale", *parts] if with_scale else parts)]
+
+
+def with_typed_lists(changed: Sequence[Parameter]) -> list[Parameter]:
+    """Give empty lists the type of their parameter: `ros2 param set` sends them as lists of truth values."""
+    lists = {declaration.name for declaration in DECLARATIONS if declaration.default == []}
+    kind = Parameter.Type.STRING_ARRAY
+    return [Parameter(p.name, kind, []) if p.name in lists and p.value == [] else p for p in changed]
 
 
 def check(

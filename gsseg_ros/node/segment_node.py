@@ -91,6 +91,8 @@ class SegmentNode(LifecycleNode):
         # In a group of its own, since it may wait for the session. That /clock does not come, it may have to tell.
         steady_timer(self, 1.0, self._tell, MutuallyExclusiveCallbackGroup())
         self.add_on_set_parameters_callback(self._check_parameters)
+        if hasattr(self, "add_pre_set_parameters_callback"):  # Humble has it not.
+            self.add_pre_set_parameters_callback(parameters.with_typed_lists)
         self._told_after = hasattr(self, "add_post_set_parameters_callback")  # Humble has the one before alone.
         if self._told_after:
             self.add_post_set_parameters_callback(self._take_parameters)

@@ -14,8 +14,9 @@ from small_scenes import clean_views
 
 pytest.importorskip("gsseg_msgs.msg", reason="gsseg_msgs is not installed")
 
+from rcl_interfaces.msg import Parameter as ParameterMessage
 from rcl_interfaces.msg import ParameterType
-from rclpy.parameter import Parameter
+from rclpy.parameter import Parameter, get_parameter_value
 
 from gsseg_ros.node.declarations import AT_ONCE, DECLARATIONS
 
@@ -68,6 +69,10 @@ STEMS = ("0_background", "1_red_ball", "2_cup_mug", "3_box")
         ("granularity", 0.5, "parameter granularity is 0.5, but with ids 'given' objects have no parts; expected -1"),
         ("granularity", 1.5, "out of range"),
         ("map_frame", "", "parameter map_frame is empty; expected the name of a frame"),
+        ("map_frame", "/map", "parameter map_frame is '/map'; expected no slash before it, as TF takes none"),
+        ("scene_frame", "/scene", "parameter scene_frame is '/scene'; expected no slash before it"),
+        ("scene_frame", "map", "parameter scene_frame is 'map', as map_frame; expected another name"),
+        ("detections_topic", "no topic", "parameter detections_topic: Invalid topic name"),
         ("data_root", "/", "read-only"),
         ("max_pixels", 2**31 - 1, "read-only"),
         ("scene_path", "/etc/passwd", "parameter scene_path, set after the start: path '/etc/passwd' is not below"),
@@ -75,6 +80,7 @@ STEMS = ("0_background", "1_red_ball", "2_cup_mug", "3_box")
         ("class_names", ["background", ""], "parameter class_names: label 1 has the name ''"),
         ("scene_to_map.scale", 0.0, "scene_to_map.scale"),
         ("scene_to_map.translation", [1.0, 2.0], "scene_to_map.translation is [1.0, 2.0]; expected 3 finite numbers"),
+        ("scene_to_map.translation", [1e308, 0.0, 0.0], "; expected metres, at most 1e+12"),
         ("scene_to_map.rotation", [0.0] * 4, "scene_to_map.rotation is all zeros"),
         ("camera_in_base.rotation", [0.0, 0.0, float("nan"), 1.0], "expected 4 finite numbers"),
     ],
@@ -91,6 +97,26 @@ def test_a_parameter_that_cannot_be_is_refused_when_it_is_set(robot: Robot, name
 def test_rectified_may_be_a_word_or_a_truth_value_as_yaml_makes_of_it(robot: Robot, value: Any) -> None:
     assert robot.set("rectified", value) == (True, "")
     assert robot.get("rectified") == value
+
+
+@pytest.mark.parametrize("name", ["obstacle_classes", "class_names", "palette", "cameras"])
+def test_a_list_can_be_emptied_as_ros2_param_set_does_which_sends_an_empty_one_as_truth_values(
+    robot: Robot, name: str
+) -> None:
+    before, given = robot.get(name), {"palette": ["#000000"], "cameras": ["front"]}.get(name, CLASSES)
+    assert robot.set(name, given) == (True, "")
+    empty = ParameterMessage(name=name, value=get_parameter_value("[]"))
+    (result,) = robot.ask("set_parameters", parameters=[empty]).results
+    assert (result.successful, robot.get(name) or []) == (True, []), result.reason
+    if before:
+        robot.set(name, before)
+
+
+def test_detections_below_the_name_of_a_camera_cannot_have_an_absolute_name(robot: Robot) -> None:
+    robot.set("cameras", ["front"])
+    taken, reason = robot.set("detections_topic", "/detections")
+    robot.set("cameras", [])
+    assert not taken and "expected a name below that of each camera" in reason
 
 
 def test_a_parameter_that_does_not_exist_cannot_be_set(robot: Robot) -> None:
