@@ -108,6 +108,10 @@ class Corrections:
             return True
         return False
 
+    def labels(self) -> set[int]:
+        """Return the classes that were drawn."""
+        return {label for drawn in self._drawn for label in np.unique(drawn.labels).tolist()}
+
     def renumber(self, ids: Mapping[int, int]) -> None:
         """Give some classes other numbers."""
         table = np.arange(MAX_LABEL + 1, dtype=np.int32)

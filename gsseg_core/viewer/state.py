@@ -12,6 +12,7 @@ from typing import Any
 
 import numpy as np
 
+from gsseg_core.data.class_names import class_name
 from gsseg_core.data.object_tree import ObjectTree
 from gsseg_core.data.view import View
 from gsseg_core.errors import SettingsError
@@ -143,17 +144,22 @@ class ViewerState:
     def replace(self, learnt: Labelling) -> None:
         """Show what a live source has learnt by now, under the same corrections.
 
-        Classes that were added here make room for those that turn up there; one of the same name becomes that class.
+        Classes that were added here make room for those that turn up there; one of the same name becomes that class. So
+        do classes that were corrected or switched off, where the source was reset and numbers its classes anew.
         """
         with self.lock:
-            taken, added, model = learnt.class_names, self.added_names, self.model
+            before, taken, model = self._learnt.class_names, learnt.class_names, self.model
+            held = before.keys() & {*self.corrections.labels(), *model.hidden, *model.removed}
+            # What had but a number may get a name.
+            gone = {k: before[k] for k in held if before[k] not in (taken.get(k), class_name({}, k))}
+            added = {**gone, **self.added_names}
             known, free = {name: k for k, name in taken.items()}, itertools.count(max([*taken, *added]) + 1)
             moved = {k: name for k, name in added.items() if k in taken or name in known}
             ids = {k: known[name] if name in known else next(free) for k, name in moved.items()}
             if ids:
                 self.corrections.renumber(ids)
-                self.added_names = {ids.get(k, k): name for k, name in added.items() if ids.get(k, k) not in taken}
                 model.hidden, model.removed = ({ids.get(k, k) for k in off} for off in (model.hidden, model.removed))
+            self.added_names = {ids.get(k, k): name for k, name in added.items() if ids.get(k, k) not in taken}
             self._learnt = learnt
             self._relabel()
 

@@ -94,6 +94,25 @@ def test_a_class_that_was_added_joins_its_namesake_wherever_that_turns_up() -> N
     assert state.objects.class_names == {**NAMES, 3: "spoon"} and (state.objects.labels[spoon] == 3).all()
 
 
+@pytest.mark.parametrize("seen_reset", [True, False])
+@pytest.mark.parametrize("comes_back", [True, False])
+def test_corrections_and_switches_stay_with_their_class_though_a_robot_that_was_reset_numbers_its_classes_anew(
+    seen_reset: bool, comes_back: bool
+) -> None:
+    state = state_of()
+    state.correct(disc(CAMERA, COLUMN, ROW, 3, 3))
+    drawn = state.objects.labels != TRUTH
+    state.change(lambda model: model.toggle(3))
+    if seen_reset:
+        state.replace(Labelling.unknown(len(SCENE)))
+        assert state.objects.class_names[3] == NAMES[3] and (state.objects.labels[drawn] == 3).all()
+    names = {0: NAMES[0], 1: NAMES[3] if comes_back else "chair", 2: NAMES[1], 3: NAMES[2]}
+    state.replace(LEARNT._replace(labels=np.array([0, 2, 3, 1], np.int32)[TRUTH], class_names=names))
+    (label,) = set(state.objects.labels[drawn].tolist())
+    assert state.objects.class_names[label] == NAMES[3] and state.model.hidden == {label}
+    assert label == (1 if comes_back else 4)
+
+
 def test_a_class_alone_is_joined_by_all_again_though_a_hidden_one_was_corrected_away() -> None:
     state = state_of()
     state.change(lambda model: model.isolate(3))
