@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+import threading
+from collections.abc import Callable, Iterator
 from contextlib import closing
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 from unittest.mock import MagicMock
 
 import numpy as np
@@ -13,16 +15,20 @@ import pytest
 from operator_cases import make_scene
 from parts_of_balls import tree_of_balls
 from patience import wait_until
-from small_scenes import NAMES, balls_on_a_table, ring
+from small_scenes import NAMES, balls_on_a_table, clean_views, ring, write_dataset
 
 pytest.importorskip("viser")
 
+from gsseg_core.data.dataset import Dataset
+from gsseg_core.errors import MaskFormatError
 from gsseg_core.scene.camera import Camera
 from gsseg_core.segmentation import Segmentation
+from gsseg_core.viewer import corrections as view_corrections
+from gsseg_core.viewer import state as view_state
 from gsseg_core.viewer.access import listen
 from gsseg_core.viewer.clients import SERVER, ClientRenderers
 from gsseg_core.viewer.corrections import disc
-from gsseg_core.viewer.model import Labelling, ViewModel
+from gsseg_core.viewer.model import ClassRow, Labelling, ViewModel
 from gsseg_core.viewer.picking import Picked
 from gsseg_core.viewer.state import ViewerState
 from gsseg_core.viewer.viewer import Viewer
@@ -44,6 +50,33 @@ def viewer() -> Iterator[Viewer]:
 
 def state_of(labelling: Labelling = LEARNT) -> ViewerState:
     return ViewerState(ViewModel(SCENE, labelling), [], {}, "cpu")
+
+
+def viewed_from(camera: Camera) -> MagicMock:
+    """A browser that looks from there, wherever it looks to."""
+    seen = MagicMock(fov=1.0, aspect=1.0, image_height=480, position=camera.center, wxyz=np.eye(4)[0])
+    return MagicMock(camera=seen)
+
+
+def click_at(client: MagicMock, gaussian: int) -> MagicMock:
+    """A click of a browser on a Gaussian."""
+    eye = client.camera.position
+    return MagicMock(client=client, ray_origin=eye, ray_direction=SCENE.means[gaussian] - eye)
+
+
+def meanwhile(viewed: ViewerState, action: Callable[[], object]) -> Callable[[], None]:
+    """What another thread does here, once: nothing where this one holds the state, so that the other has to wait."""
+    done: list[object] = []
+
+    def do() -> None:
+        try:
+            threading.Condition(viewed.lock).notify()
+        except RuntimeError:  # Not held.
+            if not done:
+                done.append(None)
+                action()
+
+    return do
 
 
 def test_a_correction_is_of_what_is_shown_and_not_of_what_is_hidden_before_it() -> None:
@@ -206,3 +239,131 @@ def test_nothing_is_drawn_for_a_browser_that_left_before_it_was_known() -> None:
     renderers._leave(client)
     renderers._join(client)
     assert not renderers.by_client
+
+
+@pytest.mark.parametrize("tool", ["the whole region", "a disc", "all that looks alike there", "a box"])
+def test_a_correction_is_of_the_class_that_was_chosen_though_classes_are_renumbered_meanwhile(
+    viewer: Viewer, tool: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    panel, viewed = viewer.panel, viewer.state
+    viewed.model.tree = None  # A live source has none.
+    panel._new.value = "spoon"
+    panel._add_class()
+    learnt = Labelling(LEARNT.labels, np.pad(LEARNT.probabilities, ((0, 0), (0, 1))), {**NAMES, K: "fork"})
+    at_once, draw = meanwhile(viewed, lambda: viewed.replace(learnt)), view_corrections._view
+
+    def drawn(*of: Any) -> Any:
+        at_once()
+        return draw(*of)
+
+    monkeypatch.setattr(view_corrections, "_view", drawn)
+    if tool == "a box":
+        panel.correct_box(CAMERA, (COLUMN - 3, ROW - 3), (COLUMN + 3, ROW + 3))
+    else:
+        panel._tool.value, panel._radius.value = tool, 10.0
+        panel.correct_at(CAMERA, COLUMN, ROW)
+    at_once()
+    assert viewed.objects.class_names[K] == "fork"
+    changed = viewed.objects.labels[viewed.objects.labels != TRUTH]
+    assert {viewed.objects.class_names[k] for k in changed} == {"spoon"}
+
+
+def test_a_segmentation_is_saved_as_it_was_though_a_live_source_has_more_classes_meanwhile(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    viewed, ids_of = state_of(), ViewModel.ids
+    more = Labelling.unknown(len(SCENE), {**NAMES, K: "fork"})
+    at_once = meanwhile(viewed, lambda: viewed.replace(more))
+
+    def ids(model: ViewModel) -> list[int]:
+        at_once()
+        return ids_of(model)
+
+    monkeypatch.setattr(ViewModel, "ids", ids)
+    (tmp_path / "s.npz").write_bytes(viewed.segmentation_npz()[1])
+    at_once()
+    saved = Segmentation.load(tmp_path / "s.npz", SCENE)
+    assert viewed.objects is more and saved.class_names == NAMES
+    np.testing.assert_array_equal(saved.labels, TRUTH)
+
+
+def test_meshes_are_of_what_was_sure_when_saving_began_though_a_live_source_is_less_sure_meanwhile(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    viewed, given, choose = state_of(), list[np.ndarray](), np.where
+    at_once = meanwhile(viewed, lambda: viewed.replace(Labelling.unknown(len(SCENE), NAMES)))
+
+    def where(*of: Any) -> Any:
+        at_once()
+        return choose(*of)
+
+    def meshes(scene: object, labels: object, confidence: np.ndarray, kind: object) -> dict[int, object]:
+        given.append(confidence)
+        return {}
+
+    monkeypatch.setattr(np, "where", where)
+    monkeypatch.setattr(view_state, "collision_meshes", meshes)
+    viewed.selection("ply")
+    assert (viewed.model.confidence == 0).all() and (given[0] == np.float32(0.9)).all()
+
+
+def test_a_search_waits_for_the_list_that_is_being_rebuilt(viewer: Viewer, monkeypatch: pytest.MonkeyPatch) -> None:
+    panel, add = viewer.panel, viewer.panel._add_row
+    rows = [row._replace(name=f"new {row.name}") for row in viewer.state.seen()[1]]
+    panel._search.value = "mug"
+    at_once = meanwhile(viewer.state, panel._filter)
+
+    def added(row: ClassRow) -> Any:
+        at_once()
+        return add(row)
+
+    monkeypatch.setattr(panel, "_add_row", added)
+    panel.show_classes(rows)
+    assert [row.name for row, button in panel._rows.values() if button.visible] == ["new cup/mug"]
+
+
+def test_the_list_is_not_rebuilt_while_it_is_searched(viewer: Viewer) -> None:
+    panel = viewer.panel
+    rows = [row._replace(name=f"new {row.name}") for row in viewer.state.seen()[1]]
+    at_once = meanwhile(viewer.state, lambda: panel.show_classes(rows))
+
+    class Search:
+        """What is searched for, in the moment in which it is read."""
+
+        @property
+        def value(self) -> str:
+            at_once()
+            return "mug"
+
+    panel._search = Search()  # type: ignore[assignment]
+    panel._filter()
+    at_once()
+    assert [row.name for row, button in panel._rows.values() if button.visible] == ["new cup/mug"]
+
+
+def test_a_click_is_answered_without_the_views_once_a_mask_cannot_be_read(tmp_path: Path) -> None:
+    data = write_dataset(tmp_path / "data")
+    views = Dataset(data).views("train")
+    (data / "labels" / f"{views[1].name}.png").write_bytes(b"no picture")
+    client = viewed_from(CAMERA)
+    with closing(Viewer(ViewModel(SCENE, LEARNT), views, listener=listen(port=18300), draw=SERVER)) as viewer:
+        for _ in range(2):
+            viewer._on_click(click_at(client, IN_BALL))
+            assert f"<strong>{NAMES[1]}</strong>, class 1" in viewer.panel.answer._answer.content
+            assert f"{views[1].name}.png" in client.add_notification.call_args.args[1]
+            assert "voted for it" not in viewer.panel.answer._answer.content
+
+
+def test_a_mask_that_cannot_be_read_leaves_the_answer_to_a_later_click(
+    viewer: Viewer, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    answer, client = viewer.panel.answer, viewed_from(CAMERA)
+
+    def view_votes(progress: object) -> None:
+        answer.show_picked(answer.ask(), Picked(0, 0.5))
+        raise MaskFormatError("view1.png: no picture")
+
+    viewer.state.views = tuple(clean_views(1))
+    monkeypatch.setattr(viewer.state, "view_votes", view_votes)
+    viewer._on_click(click_at(client, IN_BALL))
+    assert "Gaussian 0, " in answer._answer.content and "no picture" in client.add_notification.call_args.args[1]
