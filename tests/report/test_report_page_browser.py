@@ -10,8 +10,8 @@ import pytest
 from browser import opened_page
 from parts_of_balls import SCENE, TRUTH, halved, seen_as
 from PIL import Image
-from report_cases import run_with_nasty_names
-from small_scenes import NAMES, ring, write_dataset
+from report_cases import NASTY, run_with_nasty_names
+from small_scenes import NAMES, look_at, many_classes, ring, write_dataset
 
 from gsseg_core import pipeline
 from gsseg_core.data.dataset import Dataset
@@ -29,6 +29,21 @@ CANVAS = ".stage canvas"
 def report(tmp_path_factory: pytest.TempPathFactory) -> str:
     """Address of a page."""
     return (run_with_nasty_names(tmp_path_factory.mktemp("report")) / "report.html").as_uri()
+
+
+@pytest.fixture(scope="module")
+def long_report(tmp_path_factory: pytest.TempPathFactory) -> str:
+    """Address of a page of more classes than fit on it one by one, some of them under very long names."""
+    folder, (scene, truth) = tmp_path_factory.mktemp("long"), many_classes(24)
+    names = {k: NASTY.get(k, f"class {k}") for k in range(24)} | {
+        4: "x" * 200,
+        5: "a thing on the table " * 9,
+        6: "\u05e9" * 9,
+    }
+    cameras = [look_at(f"view{i}", np.array([0.1 * i, -0.9, 1.5]), 160, 120, 90.0) for i in range(4)]
+    data = write_dataset(folder / "data", scene, truth, cameras, names)
+    pipeline.segment(data / "scene.ply", data, folder / "out")
+    return (folder / "out/report.html").as_uri()
 
 
 @pytest.fixture
@@ -132,6 +147,44 @@ def test_a_phone_shows_all_of_it_without_scrolling_sideways(chromium: Browser, r
         ]
         assert (sum(paper) < 150) == (scheme == "dark")
         assert shot(page.locator(CANVAS)).std() > 5
+
+
+@pytest.mark.parametrize("width", [320, 360, 1280])
+def test_long_names_and_many_classes_break_no_figure_and_make_no_page_wider(
+    chromium: Browser, long_report: str, width: int
+) -> None:
+    figures = "td.number, td.share span, td.link a, .pairs td:nth-child(n + 3), .settings dd"
+    broken = f"""() => [...document.querySelectorAll("{figures}")]
+        .filter((figure) => {{
+          const range = document.createRange();
+          range.selectNodeContents(figure);
+          const bottoms = [...range.getClientRects()].map((line) => line.bottom);
+          return Math.max(...bottoms) - Math.min(...bottoms) > 9;
+        }}).map((figure) => figure.textContent)"""
+    with opened_page(chromium, width, 740) as page:
+        page.goto(long_report)
+        page.wait_for_selector(f"{CANVAS}[data-frames]")
+        assert page.locator(".classes.many").count() == 1
+        assert page.evaluate("document.documentElement.scrollWidth") <= width
+        assert page.evaluate(broken) == []
+
+
+def test_names_that_are_read_from_the_right_leave_sentences_in_order(opened: Page) -> None:
+    for said in opened.locator(".triple > p").all():
+        assert said.locator("bdi").count() == 2 * said.inner_text().count(", called ")
+
+
+def test_paper_gets_dark_letters_an_undistorted_preview_and_nothing_to_press(chromium: Browser, report: str) -> None:
+    with opened_page(chromium, color_scheme="dark") as page:
+        page.goto(report)
+        page.wait_for_selector(f"{CANVAS}[data-frames]")
+        page.emulate_media(media="print")
+        assert max(map(int, page.evaluate("getComputedStyle(document.body).color").strip("rgb()").split(","))) < 100
+        # On paper the canvas is as high as the list of classes, and is not drawn anew.
+        assert page.evaluate("getComputedStyle(document.querySelector('.stage canvas')).objectFit") == "contain"
+        for pressed in ("nav", ".controls", ".search", ".hint", ".only"):
+            assert not any(one.is_visible() for one in page.locator(pressed).all())
+        assert page.evaluate("getComputedStyle(document.querySelector('i.s0')).printColorAdjust") == "exact"
 
 
 def test_everything_but_the_preview_works_without_javascript(chromium: Browser, report: str) -> None:
