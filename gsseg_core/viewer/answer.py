@@ -33,7 +33,7 @@ class Answer:
         self._asked: object = None  # the last click, ...
         self._picked: tuple[Picked, Sequence[ViewVote] | None] | None = None  # ... and what it hit, while that is told
         self._node: int | None = None  # of which parts and whole are offered
-        self._answer = gui.add_html(paragraph(_ASK))
+        self._answer, self._failure = gui.add_html(paragraph(_ASK)), ""  # what is told; the last error that was
         self._parts, self._whole = (gui.add_button(f"its {what}", visible=False) for what in ("parts", "whole"))
         self._parts.on_click(lambda event: self._show_offered(event.client, state.show_parts))
         self._whole.on_click(lambda event: self._show_offered(event.client, state.show_whole))
@@ -68,7 +68,7 @@ class Answer:
 
     @contextmanager
     def telling(self, client: viser.ClientHandle | None, in_place: bool = True) -> Iterator[None]:
-        """Show errors that the user can do something about in the browser, in place of the last answer or beside it."""
+        """Show errors in the browser, in place of the last answer or beside it, until somebody's next act works."""
         try:
             yield
         except GssegError as error:
@@ -76,10 +76,14 @@ class Answer:
                 with self._state.lock:
                     self._picked = None
                     self._offer(None)
-                    self._answer.content = paragraph(f" {error}", title="That did not work.")
+                    self._answer.content = self._failure = paragraph(f" {error}", title="That did not work.")
             if client is not None:
                 text = printable(str(error))
                 client.add_notification("That did not work", text, color="red", auto_close_seconds=NOTICE)
+        else:
+            with self._state.lock:
+                if client is not None and self._answer.content == self._failure:
+                    self._answer.content = paragraph(_ASK)
 
     def _show_offered(self, client: viser.ClientHandle | None, show: Callable[[int], None]) -> None:
         with self.telling(client):

@@ -146,7 +146,7 @@ class Panel:
         for register in (go.on_click, chosen.on_update, with_mask.on_update):
             self._on(register, jump)
         self._on(steps.on_click, step)
-        self._on(hide.on_click, lambda _: self._viewpoint.hide_mask())
+        self._on(hide.on_click, lambda event: event.client and self._viewpoint.hide_mask(event.client))
 
     def _build_correct(self) -> None:
         gui = self._gui

@@ -14,6 +14,7 @@ from gsseg_core.scene.camera import Camera, rigid_motion
 from gsseg_core.viewer.state import ViewerState
 
 _OVERLAY_DISTANCE = 0.02  # of a mask from the camera, in halves of the diagonal of the scene
+_FARTHEST = 100.0  # what a browser draws at least, in halves of the diagonal
 _MASK = "/mask"
 
 
@@ -21,7 +22,7 @@ class Viewpoint:
     """Moves the cameras of browsers; at first they look from the first view, or at the scene from outside."""
 
     def __init__(self, server: viser.ViserServer, state: ViewerState) -> None:
-        self._server, self._state = server, state
+        self._state = state
         low, high = np.percentile(state.model.scene.means, [5, 95], axis=0)
         self._reach = float(np.linalg.norm(high - low)) / 2 or 3 * float(state.model.scene.scales.max())
         start = server.initial_camera
@@ -34,6 +35,7 @@ class Viewpoint:
             start.look_at = (low + high) / 2
             start.position = (low + high) / 2 + np.array([1.2, 1.2, 0.9]) * self._reach
         start.near = min(_OVERLAY_DISTANCE * self._reach / 4, 0.05)
+        start.far = max(_FARTHEST * self._reach, start.far)
 
     def jump(self, client: viser.ClientHandle, view: View, with_mask: bool) -> None:
         """Look from where a view was taken; lay its mask over the picture."""
@@ -43,17 +45,17 @@ class Viewpoint:
             client.camera.position = pose[:3, 3]
             client.camera.look_at = pose[:3, 3] + pose[:3, 2] * self._reach
             client.camera.fov = _vertical_fov(view.camera)
-        self.hide_mask()
+        self.hide_mask(client)
         if with_mask:
-            self._hang(view, pose)
-            self._server.flush()
+            self._hang(client, view, pose)
+            client.flush()
 
-    def hide_mask(self) -> None:
-        """Take the mask off the picture."""
-        self._server.scene.remove_by_name(_MASK)
-        self._server.flush()
+    def hide_mask(self, client: viser.ClientHandle) -> None:
+        """Take the mask off the picture of a browser."""
+        client.scene.remove_by_name(_MASK)
+        client.flush()
 
-    def _hang(self, view: View, pose: np.ndarray) -> None:
+    def _hang(self, client: viser.ClientHandle, view: View, pose: np.ndarray) -> None:
         """Hang the mask of a view right before its camera, of which the pose (4, 4) is camera to world."""
         camera, model = view.camera, self._state.model
         labels = view.read_labels()
@@ -62,7 +64,7 @@ class Viewpoint:
         distance = _OVERLAY_DISTANCE * self._reach
         # The middle of the image, which need not be where the optical axis is.
         middle = np.array([(camera.width / 2 - camera.cx) / camera.fx, (camera.height / 2 - camera.cy) / camera.fy, 1])
-        self._server.scene.add_image(
+        client.scene.add_image(
             _MASK,
             overlay(image, labels, colors),
             camera.width / camera.fx * distance,

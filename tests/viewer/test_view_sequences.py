@@ -367,3 +367,24 @@ def test_a_mask_that_cannot_be_read_leaves_the_answer_to_a_later_click(
     monkeypatch.setattr(viewer.state, "view_votes", view_votes)
     viewer._on_click(click_at(client, IN_BALL))
     assert "Gaussian 0, " in answer._answer.content and "no picture" in client.add_notification.call_args.args[1]
+
+
+def test_an_error_is_told_until_somebody_does_what_works(viewer: Viewer) -> None:
+    answer, client = viewer.panel.answer, viewed_from(CAMERA)
+    with answer.telling(client):
+        viewer.state.selection("no such format")
+    with answer.telling(None):  # What the viewer sets itself is nobody's act.
+        pass
+    assert "That did not work" in answer._answer.content
+    with answer.telling(client):
+        viewer.state.undo()
+    assert "Click on something" in answer._answer.content
+    viewer._on_click(click_at(client, IN_BALL))
+    assert f"<strong>{NAMES[1]}</strong>" in answer._answer.content
+
+
+def test_a_large_scene_is_within_what_a_browser_draws() -> None:
+    scene = make_scene([[0, 0, 4e4], [0, 5e4, 9e4]], [[1, 0, 0, 0]] * 2, [[300, 300, 10]] * 2, [0.97] * 2)
+    with closing(Viewer(ViewModel(scene, Labelling.unknown(2)), listener=listen(port=18300), draw=SERVER)) as viewer:
+        start = viewer.server.initial_camera
+        assert start.far > 2 * np.linalg.norm(scene.means - start.position, axis=1).max()
