@@ -35,11 +35,8 @@ def report(tmp_path_factory: pytest.TempPathFactory) -> str:
 def long_report(tmp_path_factory: pytest.TempPathFactory) -> str:
     """Address of a page of more classes than fit on it one by one, some of them under very long names."""
     folder, (scene, truth) = tmp_path_factory.mktemp("long"), many_classes(24)
-    names = {k: NASTY.get(k, f"class {k}") for k in range(24)} | {
-        4: "x" * 200,
-        5: "a thing on the table " * 9,
-        6: "\u05e9" * 9,
-    }
+    long = {4: "x" * 200, 5: "a thing on the table " * 9, 6: "\u05e9" * 9, 7: "object_007"}
+    names = {k: f"class {k}" for k in range(24)} | NASTY | long
     cameras = [look_at(f"view{i}", np.array([0.1 * i, -0.9, 1.5]), 160, 120, 90.0) for i in range(4)]
     data = write_dataset(folder / "data", scene, truth, cameras, names)
     pipeline.segment(data / "scene.ply", data, folder / "out")
@@ -167,6 +164,8 @@ def test_long_names_and_many_classes_break_no_figure_and_make_no_page_wider(
         assert page.locator(".classes.many").count() == 1
         assert page.evaluate("document.documentElement.scrollWidth") <= width
         assert page.evaluate(broken) == []
+        whole = page.locator("td.name:has-text('object_007')").evaluate("name => name.scrollWidth <= name.clientWidth")
+        assert whole, "the names that objects get are told apart by their end"
 
 
 def test_names_that_are_read_from_the_right_leave_sentences_in_order(opened: Page) -> None:
