@@ -143,10 +143,14 @@ class Panel:
             _set(chosen, texts[(_chosen(chosen, texts) + by) % len(texts)])
             jump(event)
 
+        def uncover(event: Event) -> None:
+            if event.client is not None:
+                self._viewpoint.hide_mask(event.client)
+
         for register in (go.on_click, chosen.on_update, with_mask.on_update):
             self._on(register, jump)
         self._on(steps.on_click, step)
-        self._on(hide.on_click, lambda event: event.client and self._viewpoint.hide_mask(event.client))
+        self._on(hide.on_click, uncover)
 
     def _build_correct(self) -> None:
         gui = self._gui
