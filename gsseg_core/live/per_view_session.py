@@ -14,7 +14,7 @@ import numpy as np
 from gsseg_core.data.dataset import Dataset
 from gsseg_core.data.view import View
 from gsseg_core.errors import GssegError, SettingsError
-from gsseg_core.learn.learner import VOTE_UNIT
+from gsseg_core.learn.learner import UNITS, VOTE_UNIT
 from gsseg_core.learn.learner_state import Learnt, State
 from gsseg_core.learn.vote_learner import VoteLearner
 from gsseg_core.live.results import Outcome, Rejection
@@ -147,15 +147,13 @@ class PerViewSession(LiveSession):
         """Replace all that is known by a saved state, as `LiveSession.load` does; its labels are numbers of objects."""
         with self._lock:
             loaded = super().load(path, within)
+            votes = self._live.state().votes
             for view in self._live.views.values():
-                self._table.adopt(view)
+                if observation := self._table.adopt(view):
+                    observation.vote(votes, UNITS, -1)
             self._table.reserve(self._live.num_classes - 1)
-            if self.num_fused > self.num_views:  # What views that are gone have shown is not new.
-                gone = self._no_votes(1)
-                gone.adopt(self._live.state())
-                for name in self.view_names:
-                    gone.retract(name)
-                self._table.recall(gone.state().votes * VOTE_UNIT)
+            if self.num_fused > self.num_views:  # The votes left are of dropped views; what those have shown is not new.
+                self._table.recall(votes * VOTE_UNIT)
         return loaded
 
     def _forget(self, class_names: Mapping[int, str], votes: VoteLearner) -> None:

@@ -18,6 +18,7 @@ from gsseg_core.objects.lifted_segments import Lifted, Profiles, sums
 from gsseg_core.objects.tree_growing import grow_tree
 from gsseg_core.progress import Progress, silent
 from gsseg_core.raster.backends import make_operator
+from gsseg_core.raster.observation import Observation
 from gsseg_core.scene.gaussian_scene import GaussianScene
 from gsseg_core.segmentation import REMOVED, Segmentation
 from gsseg_core.several_at_once import each_with_made
@@ -132,10 +133,12 @@ class ObjectTable:
 
         return undo
 
-    def adopt(self, view: View) -> None:
-        """Add a view whose ids are the numbers of objects already."""
-        if self.add(view):
+    def adopt(self, view: View) -> Observation | None:
+        """Add a view whose ids are the numbers of objects already; returns it lifted, None where `add` tells False."""
+        lifted = self._lift(view)
+        if self._add(view, lifted):
             self._give(view.name, self._lifted[view.name].ids)
+        return lifted and lifted[1]
 
     def reserve(self, number: int) -> None:
         """Give no new object a number up to this one."""
@@ -245,7 +248,8 @@ class ObjectTable:
             **({} if tree is None else {"tree": tree.describe(result.class_names, tree.sizes(result.labels))}),
         }
 
-    def _lift(self, view: View) -> Lifted | None:
+    def _lift(self, view: View) -> tuple[Lifted, Observation] | None:
+        """Lift the segments of a view to the Gaussians; None where it has no labels or sees no Gaussian."""
         if not view.has_mask:
             return None
         # Names of classes say nothing of ids that are a view's own.
@@ -256,14 +260,14 @@ class ObjectTable:
         observation = operator.observe(labels)
         if not len(observation.ids):
             return None
-        return Lifted.of(observation, self.settings.kept).bordered(self.scene, operator, labels)
+        return Lifted.of(observation, self.settings.kept).bordered(self.scene, operator, labels), observation
 
-    def _add(self, view: View, lifted: Lifted | None) -> bool:
+    def _add(self, view: View, lifted: tuple[Lifted, Observation] | None) -> bool:
         if lifted is None:
             return False
         if view.name in self.views:
             self.remove(view.name)
-        self.views[view.name], self._lifted[view.name] = replace(view, class_names=None), lifted
+        self.views[view.name], self._lifted[view.name] = replace(view, class_names=None), lifted[0]
         return True
 
     def _give(self, name: str, objects: np.ndarray) -> None:

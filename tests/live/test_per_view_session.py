@@ -26,7 +26,11 @@ from gsseg_core.learn.em.em_learner import EMLearner
 from gsseg_core.learn.learner_state import Learnt
 from gsseg_core.live.per_view_session import PerViewSession
 from gsseg_core.live.session import LiveSession
+from gsseg_core.raster.backends import make_operator
+from gsseg_core.raster.view_operator import ViewOperator
 from gsseg_core.refine.settings import UNREFINED
+from gsseg_core.scene.camera import Camera
+from gsseg_core.scene.gaussian_scene import GaussianScene
 
 SCENE, TRUTH = balls_on_a_table()
 VIEWS = clean_views(8)
@@ -69,6 +73,28 @@ def test_a_live_session_goes_on_with_its_objects_after_saving_and_loading(tmp_pa
     np.testing.assert_array_equal(other.codes(), session.codes())
     with pytest.raises(SettingsError, match="from the views received only"):
         other.learn(dataset=Dataset(write_dataset(tmp_path / "data")))
+
+
+def test_a_state_with_dropped_views_is_loaded_with_one_lift_of_each_kept_view(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    session = PerViewSession(SCENE, max_views=3)
+    for view in VIEWS[:5]:
+        session.fuse(shuffled(view))
+    session.save(tmp_path / "state.npz")
+    made: list[str] = []
+
+    def counted(scene: GaussianScene, camera: Camera, device: str) -> ViewOperator:
+        made.append(camera.name)
+        return make_operator(scene, camera, device)
+
+    monkeypatch.setattr("gsseg_core.learn.learner.make_operator", counted)
+    monkeypatch.setattr("gsseg_core.objects.object_table.make_operator", counted)
+    other = PerViewSession(SCENE)
+    other.load(tmp_path / "state.npz")
+    assert made == [view.name for view in VIEWS[2:5]]
+    assert other.fuse(shuffled(VIEWS[0])) is None
+    assert other._live.num_classes == session._live.num_classes, "what dropped views have shown is not new"
 
 
 def test_objects_that_a_session_has_numbered_are_no_classes_of_another(tmp_path: Path) -> None:
