@@ -49,6 +49,11 @@ def class_name(names: Mapping[int, str], k: int) -> str:
     return names.get(k, f"class_{k:02d}")
 
 
+def names_together(known: Mapping[int, str], given: Mapping[int, str]) -> dict[int, str]:
+    """Add names of classes to those that are known; one like "class_07" replaces none."""
+    return {**known, **{k: name for k, name in given.items() if k not in known or name != class_name({}, k)}}
+
+
 def check_same_names(
     names: Mapping[int, str], known: Mapping[int, str], source: object, where: str, error: type[GssegError]
 ) -> None:

@@ -8,7 +8,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from gsseg_core.data.class_names import class_name
+from gsseg_core.data.class_names import names_together
 from gsseg_core.data.view import View
 from gsseg_core.errors import StateFileError, StateMismatchError
 from gsseg_core.learn.learner_state import OBJECTS_OF_ONE_SESSION, State
@@ -58,7 +58,8 @@ def merge_states(saved: Sequence[Saved]) -> State:  # at least one
             raise StateFileError(
                 f"{one.source}: {OBJECTS_OF_ONE_SESSION}; expected classes whose ids mean the same in all states"
             )
-        _add_names(names, one)
+        one.state.check_names(names, one.source, "in the states before it")
+        names = names_together(names, one.state.class_names)
         for other in saved[:number]:
             if _is_same_state(one.state, other.state):
                 raise StateFileError(
@@ -75,12 +76,6 @@ def merge_states(saved: Sequence[Saved]) -> State:  # at least one
     return replace(
         first.state, votes=votes, views=[*views.values()], num_fused=num_fused, class_names=class_names, learnt=None
     )
-
-
-def _add_names(names: dict[int, str], one: Saved) -> None:
-    one.state.check_names(names, one.source, "in the states before it")
-    given = one.state.class_names.items()
-    names.update({k: name for k, name in given if k not in names or name != class_name({}, k)})
 
 
 def _free_name(name: str, taken: dict[str, View]) -> str:

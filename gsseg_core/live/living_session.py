@@ -185,15 +185,14 @@ class LivingSession(LiveSession):
         """
         with self._lock:
             digest, now = self.scene.digest, self._live.state()
-            now = replace(now, num_fused=self.num_fused, class_names=self._names, living=None)
+            now = replace(now, num_fused=self.num_fused, class_names=self._classes.names, living=None)
             saved = [Saved("what is known here", digest, now)]
             for path in paths:
                 state = self._read_state(Path(path), within)
                 self._check_classes(path, state)
                 saved.append(Saved(str(path), digest, replace(state, living=None)))
             merged = merge_states(saved)
-            if not self._declared:
-                self._names = merged.class_names
+            self._classes.reset(merged.class_names)
             came, self.num_fused = merged.num_fused - self.num_fused, merged.num_fused
             self._live.adopt(merged)
             self._version += 1

@@ -152,7 +152,7 @@ class PerViewSession(LiveSession):
                 if observation := self._table.adopt(view):
                     observation.vote(votes, UNITS, -1)
             self._table.reserve(self._live.num_classes - 1)
-            if self.num_fused > self.num_views:  # The votes left are of dropped views; what those have shown is not new.
+            if self.num_fused > self.num_views:  # The votes left are of dropped views: what these showed is not new.
                 self._table.recall(votes * VOTE_UNIT)
         return loaded
 

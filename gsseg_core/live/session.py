@@ -12,18 +12,18 @@ from weakref import WeakKeyDictionary
 
 import numpy as np
 
-from gsseg_core.data.class_names import BACKGROUND_NAME, class_name
+from gsseg_core.data.class_names import class_name
 from gsseg_core.data.dataset import Dataset
 from gsseg_core.data.view import View, spread
 from gsseg_core.errors import GssegError, NoCodesError, NoUsableViewsError, SettingsError, StateFileError
 from gsseg_core.learn.learner_state import OBJECTS_OF_ONE_SESSION, Learnt, State
 from gsseg_core.learn.registry import make_learner
 from gsseg_core.learn.vote_learner import VoteLearner
-from gsseg_core.live.class_numbers import add_names, check_classes_of, ids_by_name, require_affordable
 from gsseg_core.live.current_codes import Known, current_codes, current_evidence
-from gsseg_core.live.fitting import Report, check_names_of, fitted, names_with, num_classes_with
+from gsseg_core.live.fitting import Report, fitted
 from gsseg_core.live.living_votes import without_groups
 from gsseg_core.live.results import SCENE_CHANGED, Outcome, Rejection
+from gsseg_core.live.session_classes import SessionClasses
 from gsseg_core.progress import Stopwatch
 from gsseg_core.refine.settings import UNREFINED, RefineSettings
 from gsseg_core.scene.camera import Camera
@@ -79,17 +79,17 @@ class LiveSession:
         for name, value in (("max_views", max_views), ("max_classes", max_classes)):
             if value < 1:
                 raise SettingsError(f"{name} is {value}; expected at least 1")
-        self.scene, self.max_views, self.device, self.max_classes = scene, max_views, device, max_classes
+        self.scene, self.max_views, self.device = scene, max_views, device
         self.rejected: Counter[str] = Counter()
-        self._declared, self._names = bool(class_names), {0: BACKGROUND_NAME, **(class_names or {})}
+        self._classes = SessionClasses(class_names, max_classes)
         self._lock, self._version = threading.RLock(), 0
         self._scenes: WeakKeyDictionary[Segmentation, GaussianScene] = WeakKeyDictionary()
-        self._forget({}, self._no_votes(self._min_classes))
+        self._forget({}, self._no_votes(self._classes.least))
 
     @property
     def class_names(self) -> dict[int, str]:
         """Names by id, of every class; one without a name is called like "class_07"."""
-        names = self._names.copy()  # At once: nobody who asks for names waits for a view that is being fused.
+        names = self._classes.names  # At once: nobody who asks for names waits for a view that is being fused.
         return {k: class_name(names, k) for k in range(self._live.num_classes)}
 
     @property
@@ -126,8 +126,8 @@ class LiveSession:
     def number_classes(self, names: Mapping[int, str], *, keep_numbers: bool = True) -> dict[int, int]:
         """Find the ids of a segmenter's classes, by its numbers, and add those that are new; see `ids_by_name`."""
         with self._lock:
-            ids = ids_by_name(names, self._names, 0 if self._declared else self.max_classes, keep_numbers=keep_numbers)
-            self._version += not self._declared and add_names(self._names, names, ids)
+            ids, any_new = self._classes.number(names, keep_numbers=keep_numbers)
+            self._version += any_new
             return ids
 
     def fuse(self, view: View, era: object = None) -> Rejection | None:
@@ -219,17 +219,16 @@ class LiveSession:
             carried = self._carrier()
         if dataset is not None:
             views = dataset.views("train")
-            check_names_of(dataset, self._names if self._declared or self.num_fused else {})
-            if not self._declared:
-                num_classes = num_classes_with(dataset, num_classes, self.max_classes, len(scene))
+            self._classes.check_dataset(dataset, fused=self.num_fused > 0)
+            num_classes = self._classes.count_with(dataset, num_classes, len(scene))
         made = make_learner(learner, scene, num_classes, max_steps=max_steps, device=self.device)
         views = spread(views, num_views)
         outcome = fitted(learner, made, views, report, watch or Stopwatch())
         with self._lock:
             if era is not self._era:
                 raise NoUsableViewsError("all views were forgotten while they were learnt from; nothing was learnt")
-            if dataset is not None and not self._declared:
-                self._names = names_with(dataset, self._names, fused=self.num_fused > 0)
+            if dataset is not None:
+                self._classes.add(dataset, fused=self.num_fused > 0)  # Views may have come meanwhile.
             self._live.resize(max(num_classes, self._live.num_classes))
             self._learnt = learnt = carried(outcome.learnt)
             self._cameras = [] if dataset is None else [view.camera for view in views]
@@ -326,7 +325,7 @@ class LiveSession:
         self._check_classes(path, state)
         votes = self._no_votes(state.votes.shape[1])
         votes.adopt(state)  # To cast votes of old anew takes long.
-        votes.resize(max(state.num_classes, self._min_classes))  # If that takes too much memory, nothing is forgotten.
+        votes.resize(max(state.num_classes, self._classes.least))  # Out of memory here, nothing is forgotten.
         with self._lock:
             self._forget(state.class_names, votes)
             self.num_fused, self._learnt = state.num_fused, state.learnt
@@ -351,18 +350,12 @@ class LiveSession:
         with self._lock:
             dropped = self.num_fused
             self.rejected.clear()
-            self._forget({}, self._no_votes(self._min_classes))
+            self._forget({}, self._no_votes(self._classes.least))
         return dropped
-
-    @property
-    def _min_classes(self) -> int:
-        """How many classes there are before any view has come: those declared, or the background alone."""
-        return max(self._names) + 1 if self._declared else 1
 
     def _forget(self, class_names: Mapping[int, str], votes: VoteLearner) -> None:
         """Replace all that is known by names of classes and the votes of a state, or of none."""
-        if not self._declared:
-            self._names = {0: BACKGROUND_NAME, **class_names}
+        self._classes.reset(class_names)
         self._live, self._cameras, self.num_fused = votes, [], 0
         self._learnt = self._segmented = None
         self._version += 1
@@ -379,7 +372,7 @@ class LiveSession:
         """Raise `StateFileError` if a state has too many classes, other names than were declared, or objects."""
         if state.per_view and not self._PER_VIEW:
             raise StateFileError(f"{path}: {OBJECTS_OF_ONE_SESSION}; expected classes, or a session with ids per-view")
-        check_classes_of(state, path, self._names if self._declared else {}, self.max_classes, len(self.scene))
+        self._classes.check_state(state, path, len(self.scene))
 
     def _posed_views(self) -> list[View]:
         """List the views that are kept, posed in the scene as it is now."""
@@ -390,10 +383,11 @@ class LiveSession:
         return lambda learnt: learnt
 
     def _grow_for(self, view: View) -> None:
-        if not self._declared and view.has_mask and (needed := view.largest_label + 1) > self._live.num_classes:
-            what = f"view '{view.name}': {self._LABEL}"
-            require_affordable(needed, self.max_classes, len(self.scene), what, self._REMEDY)
-            self._live.resize(needed)
+        """Add classes up to the largest label of a view, unless they were declared."""
+        if not self._classes.declared and view.has_mask and view.largest_label >= self._live.num_classes:
+            found = f"view '{view.name}': {self._LABEL} {view.largest_label}"
+            self._classes.check_label(view.largest_label, len(self.scene), found, self._REMEDY)
+            self._live.resize(view.largest_label + 1)
 
     def _drop_old_views(self) -> None:
         while len(self._live.views) > self.max_views:

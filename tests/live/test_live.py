@@ -24,7 +24,7 @@ from gsseg_core.errors import (
 )
 from gsseg_core.learn.em.em_learner import EMLearner
 from gsseg_core.learn.vote_learner import VoteLearner
-from gsseg_core.live import class_numbers
+from gsseg_core.live import session_classes
 from gsseg_core.live.living_session import LivingSession
 from gsseg_core.live.session import LiveSession
 from gsseg_core.refine.settings import UNREFINED, RefineSettings
@@ -67,7 +67,7 @@ def test_classes_turn_up_with_their_labels_unless_they_were_declared() -> None:
 
 
 def test_a_label_that_would_take_too_much_memory_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(class_numbers, "VOTES_LIMIT", 8 * len(SCENE) * 10)
+    monkeypatch.setattr(session_classes, "VOTES_LIMIT", 8 * len(SCENE) * 10)
     session = LiveSession(SCENE)
     assert session.fuse(blank(VIEWS[0], 9)) is None
     rejection = session.fuse(blank(VIEWS[1], 10))
@@ -80,7 +80,7 @@ def test_neither_a_dataset_nor_a_state_brings_more_classes_than_there_is_memory_
 ) -> None:
     fed(LiveSession(SCENE)).save(tmp_path / "state.npz")
     data = Dataset(write_dataset(tmp_path / "data"))
-    monkeypatch.setattr(class_numbers, "VOTES_LIMIT", 8 * len(SCENE) * 3)
+    monkeypatch.setattr(session_classes, "VOTES_LIMIT", 8 * len(SCENE) * 3)
     session = LivingSession(SCENE)
     for take_in in (session.load, lambda path: session.merge([path])):
         with pytest.raises(StateFileError, match="holds 4 classes; expected at most 3 for a scene of 626 Gaussians"):

@@ -201,7 +201,7 @@ def test_a_repair_that_finds_too_many_objects_changes_nothing() -> None:
         session.repair()
     np.testing.assert_array_equal(session.codes(), before)
     assert session.num_views == session.num_fused == len(VIEWS)
-    session.max_classes = 256
+    session._classes._max_classes = 256
     assert session.repair().changed, "which has not been done yet"
 
 

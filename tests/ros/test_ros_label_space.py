@@ -120,7 +120,7 @@ def test_a_label_map_renames_merges_and_ignores_what_label_info_names() -> None:
 def test_a_label_map_alone_goes_by_numbers_and_with_class_names_by_these() -> None:
     node = Node(label_map={"2": None, "3": "cup", "4": "class_01", "5": "cup"})
     assert node.classes([0, 1, 2, 3, 4, 5]) == [0, 1, -1, 3, 1, 3]
-    assert node.session._names == {0: "background", 3: "cup"}  # Others have no name yet: label_info may tell one.
+    assert node.session._classes.names == {0: "background", 3: "cup"}, "label_info may name others"
     node = Node(("background", "wall", "armchair", "person"), {"armchair": "chair", "person": None})
     assert node.space.classes == {0: "background", 1: "wall", 2: "armchair", 3: "person", 4: "chair"}
     assert node.classes([0, 1, 2, 3]) == [0, 1, 4, -1]
@@ -146,7 +146,7 @@ def test_a_label_stays_that_of_its_name_where_a_dataset_or_a_saved_state_numbers
     node = Node()
     node.space.hear({1: "chair"})
     assert node.classes([1]) == [1]
-    node.session._names = {0: "background", 1: "cup", 2: "chair"}
+    node.session._classes.names = {0: "background", 1: "cup", 2: "chair"}
     assert node.classes([1]) == [2]
 
 

@@ -8,8 +8,8 @@ from hypothesis import strategies as st
 from small_scenes import balls_on_a_table
 
 from gsseg_core.errors import UnknownLabelError
-from gsseg_core.live.class_numbers import ids_by_name
 from gsseg_core.live.session import LiveSession
+from gsseg_core.live.session_classes import ids_by_name
 
 names = st.dictionaries(st.integers(0, 9), st.sampled_from(["background", "chair", "table", "wall", "cup"]), max_size=6)
 known = st.dictionaries(st.integers(1, 9), st.sampled_from(["chair", "table", "door"]), max_size=3)
@@ -61,6 +61,6 @@ def test_a_session_with_declared_classes_learns_no_names() -> None:
 
 def test_a_class_that_was_only_numbered_gets_its_name_when_it_is_told() -> None:
     session = LiveSession(balls_on_a_table()[0])
-    session._names = {0: "background", 1: "class_01", 2: "chair"}  # As of a saved state.
+    session._classes.names = {0: "background", 1: "class_01", 2: "chair"}  # As of a saved state.
     assert session.number_classes({1: "cup", 2: "table"}) == {1: 1, 2: 3}
-    assert session._names == {0: "background", 1: "cup", 2: "chair", 3: "table"}
+    assert session._classes.names == {0: "background", 1: "cup", 2: "chair", 3: "table"}
