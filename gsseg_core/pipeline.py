@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 from contextlib import ExitStack
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -14,37 +14,24 @@ from gsseg_core.align.placing import Placed, place
 from gsseg_core.data.dataset import Dataset
 from gsseg_core.data.hints import FRAME_HINT, mask_hint
 from gsseg_core.data.label_images import GLOBAL, PER_VIEW, write_mask
-from gsseg_core.data.view import QUALITIES, View, spread
+from gsseg_core.data.view import QUALITIES, spread
 from gsseg_core.errors import NoUsableViewsError, SettingsError
-from gsseg_core.export.class_files import class_paths, mesh_file_name, write_classes
-from gsseg_core.export.collision import collision_meshes
 from gsseg_core.export.pictures import save_png
-from gsseg_core.export.summary import RunReport, RunSettings, class_table
-from gsseg_core.export.view_pictures import (
-    Drawn,
-    draw_views,
-    draw_worst_views,
-    look_and_draw,
-    view_file_name,
-    write_overview,
-    write_pictures,
-)
+from gsseg_core.export.summary import RunSettings
+from gsseg_core.export.view_pictures import Drawn, draw_views, look_and_draw, view_file_name, write_overview
 from gsseg_core.files.json_files import write_json
-from gsseg_core.files.run_folder import StagedRun, staged_run
-from gsseg_core.files.write_behind import WriteBehind, writing_behind
-from gsseg_core.learn.calibrate import Calibration, calibrate
+from gsseg_core.files.run_folder import staged_run
+from gsseg_core.files.write_behind import writing_behind
+from gsseg_core.learn.calibrate import calibrate
 from gsseg_core.learn.learner import NO_MASK, SEES_NOTHING, Learner
-from gsseg_core.learn.mask_reliability import MaskChecker, ViewCheck, compare_mask, reliability_report, shown_views
+from gsseg_core.learn.mask_reliability import MaskChecker, reliability_report, shown_views
 from gsseg_core.learn.prepared_views import default_budget
 from gsseg_core.learn.registry import make_learner
-from gsseg_core.objects.object_table import ObjectTable, find_objects
+from gsseg_core.objects.object_table import find_objects
 from gsseg_core.progress import Progress, Stopwatch, silent, with_progress
 from gsseg_core.refine.label_propagation import UNKNOWN_SHARE, GraphSettings, propagate
 from gsseg_core.refine.settings import RefineSettings
-from gsseg_core.report.findings import MaskChecks
-from gsseg_core.report.page import load_templates, write_report_page
-from gsseg_core.report.pictures import ViewImages
-from gsseg_core.report.sections import PageInputs
+from gsseg_core.report.run_files import Assessment, Inputs, write_run
 from gsseg_core.scene.gaussian_scene import GaussianScene
 from gsseg_core.scene.scene_writers import DEFAULT as DEFAULT_FORMAT
 from gsseg_core.segmentation import Segmentation
@@ -56,36 +43,6 @@ if TYPE_CHECKING:
     from distributed import Client
 
 PICTURED_VIEWS = 12  # views that `segment` draws, spread evenly over the dataset
-
-
-@dataclass(frozen=True, eq=False)
-class Inputs:
-    """What a run learns from."""
-
-    scene: GaussianScene
-    digest: str  # of the scene as it is in its file
-    places: np.ndarray | None  # (N,) int64 in this scene of the Gaussians in that order; None where it is the same
-    root: Path  # of the dataset
-    train: list[View]
-    looked_at: list[View]  # of these, to carve objects by
-    pictured: list[View]
-    class_names: Mapping[int, str]  # of classes as they are learnt, numbered without gaps
-    class_ids: tuple[int, ...] | None  # of these classes in the dataset; None where the classes are objects
-    frame: Mapping[str, Any]  # `frame` in `report.json`
-    masks: Mapping[str, Any] | None  # `masks` in `report.json`
-    objects: ObjectTable | None = None  # which the ids of the views were found to be
-
-
-@dataclass(frozen=True, eq=False)
-class Assessment:
-    """What is known of the views once they have been learnt from."""
-
-    views: Mapping[str, View]  # by name, those that were used
-    checks: list[ViewCheck] | None  # their masks beside what the others predict; None where the learner cannot tell
-    calibration: Calibration
-    objective: list[float]  # of the learner, after each step
-    report: Mapping[str, Any]  # `views` in `report.json`
-    memory: Mapping[str, int]  # `prepared_views` there
 
 
 def segment(
@@ -212,7 +169,7 @@ def segment(
             result = inputs.objects.with_tree(result) if inputs.objects else result
         with ExitStack() as writing:
             behind = writing.enter_context(writing_behind())
-            report = _write(run, inputs, assessment, result, drawn, settings, watch, behind)
+            report = write_run(run, inputs, assessment, result, drawn, settings, watch, behind)
             with watch.stage("export"):  # what is left of it
                 writing.close()
         write_json(run.folder / "report.json", report.as_dict())
@@ -300,62 +257,6 @@ def _assess(learner: Learner, class_names: Mapping[int, str], watch: Stopwatch, 
     in_memory, in_file = learner.prepared_bytes()
     memory = {"budget": learner.memory_budget, "in_memory": in_memory, "in_file": in_file}
     return Assessment(dict(learner.views), checks, calibration, learner.history_, views, memory)
-
-
-def _write(
-    run: StagedRun, inputs: Inputs, assessment: Assessment, result: Segmentation, drawn: Mapping[str, Drawn],
-    settings: RunSettings, watch: Stopwatch, behind: WriteBehind[...],
-) -> RunReport:  # fmt: skip
-    """Write all files of a run but `report.json`, some of them behind the work, and report it."""
-    scene, folder, level = inputs.scene, run.folder, result.at(settings.granularity)
-    named = result if inputs.class_ids is None else result.with_ids(inputs.class_ids)
-    exported = named if level is result else level
-    with watch.stage("export"):
-        behind(load_templates)
-        if level is not result:
-            run.claim(settings.places(level.class_names, inputs.pictured))
-        in_file = named if inputs.places is None else named.in_order_of(inputs.digest, inputs.places)
-        behind(in_file.save, folder / "segmentation.npz", run.id)
-        meshes = collision_meshes(scene, exported.labels, exported.confidence, settings.collision)
-        files = class_paths(exported, folder / "classes", settings.scene_format)
-        behind(write_classes, scene, exported, folder / "classes", run.id, settings.scene_format, meshes, inputs.places)
-    with watch.stage("pictures"):
-        images = ViewImages(scene, settings.device, drawn.values())
-        shown = [drawn[view.name] for view in inputs.pictured]
-        checked, pictures = _picture(run, inputs, assessment, result, level, shown, images, behind)
-    with watch.stage("report page"):
-        report = RunReport.of(
-            scene, exported, run=run.id, views=assessment.report, settings=settings.as_dict(), seconds=watch.seconds,
-            objective=assessment.objective, calibration=assessment.calibration.as_dict(), frame=inputs.frame,
-            prepared_views=assessment.memory, masks=inputs.masks,
-            ids=inputs.objects and inputs.objects.summary(result), digest=inputs.digest,
-            files={k: str(path.relative_to(folder)) for k, path in files.items()},
-            meshes={k: f"classes/{mesh_file_name(k, exported.class_names[k])}" for k in meshes},
-            pictures=[str(path.relative_to(folder)) for path in pictures],
-        )  # fmt: skip
-        told = report if level is result else replace(report, classes=class_table(scene, result))
-        write_report_page(folder / "report.html", PageInputs(told.as_dict(), scene, result, checked, images))
-    return replace(report, page="report.html", seconds=watch.seconds)
-
-
-def _picture(
-    run: StagedRun, inputs: Inputs, assessment: Assessment, result: Segmentation, level: Segmentation,
-    shown: Iterable[Drawn], images: ViewImages, behind: WriteBehind[...],
-) -> tuple[MaskChecks, list[Path]]:  # fmt: skip
-    """Write the pictures; images of views that are rendered for them are kept for the report page."""
-    views, folder, checks = assessment.views, run.folder / "pictures", list(assessment.checks or ())
-    if assessment.checks is None:  # What is compared then is drawn in full size.
-        views = {view.name: view for view in inputs.train if view.name in views}
-        compared = [drawn for drawn in shown if drawn.view.name in views]
-        checks = [compare_mask(views[drawn.view.name], drawn.labels, result.num_classes) for drawn in compared]
-    save = partial(behind, save_png, run=run.id)
-    if level is not result:  # What is compared with the masks are objects, as they are.
-        shown = draw_views(inputs.scene, level, inputs.pictured, device=images.device)
-    pictures = write_pictures(level, shown, folder, save)
-    if assessment.checks:
-        pictures.append(folder / "worst_views.png")
-        save(pictures[-1], draw_worst_views(images.rendered, views, assessment.checks, device=images.device))
-    return MaskChecks(checks, views, assessment.checks is not None), pictures
 
 
 def render(

@@ -28,7 +28,7 @@ from gsseg_core.files.npz_files import (
     write_npz,
 )
 from gsseg_core.files.run_folder import settle
-from gsseg_core.learn.temperature import tempered
+from gsseg_core.learn.temperature import check_temperature, tempered
 from gsseg_core.raster.view_operator import ViewOperator
 from gsseg_core.raster.view_renderer import Blended
 from gsseg_core.refine.knn_filter import cluster_in_place, statistical_filter
@@ -171,8 +171,7 @@ class Segmentation:
         What blends into a view are always the shares that were learnt; a pixel's probability is what they blend to, at
         this temperature, above 0; else `SettingsError`.
         """
-        if not 0 < temperature < np.inf:
-            raise SettingsError(f"temperature is {temperature}; expected a number above 0")
+        check_temperature(temperature)
         change = temperature / self.temperature
         return replace(self, probabilities=tempered(self.probabilities, change), temperature=temperature)
 

@@ -1,4 +1,4 @@
-"""What `fit` sets, all that ends with "_": an error half-way leaves it as it was."""
+"""Fitting that is all or nothing: an error half-way leaves learnt attributes, those that end with "_", as they were."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ R = TypeVar("R")
 
 
 def all_or_nothing(fit: Callable[P, R]) -> Callable[P, R]:
-    """Make a `fit` that leaves what an earlier one has set, all that ends with "_", if an error ends it half-way."""
+    """Decorate a `fit`: if an error ends it half-way, all attributes that end with "_" are those of an earlier one."""
 
     @wraps(fit)
     def whole(*args: P.args, **kwargs: P.kwargs) -> R:

@@ -37,7 +37,7 @@ NO_MASK, SEES_NOTHING, ALL_UNKNOWN = "no mask", "sees no Gaussian", "all pixels 
 Self = TypeVar("Self", bound="Learner")
 R = TypeVar("R")
 
-_ALONE = threading.Lock()  # of two threads at work on a view each, one at a time lends out the votes
+_VOTES_LENT = threading.Lock()  # held while a view's votes are taken out of the sum, by one thread at a time
 
 
 class UnusableViewError(Exception):
@@ -45,7 +45,7 @@ class UnusableViewError(Exception):
 
 
 class Learner(ABC):
-    """Base class of what learns which class each Gaussian of a scene belongs to; `fit` sets what ends with "_".
+    """Base class of learners, which find the class of each Gaussian of a scene; `fit` sets what ends with "_".
 
     Parameters
     ----------
@@ -245,7 +245,7 @@ class Learner(ABC):
     def vote_codes_without(self, name: str) -> np.ndarray:
         """Votes of all other views as probabilities, (N, K) float32; a row of zeros where none saw the Gaussian."""
         observation = self.observation(name)
-        with _ALONE:
+        with _VOTES_LENT:
             observation.vote(self._votes, UNITS, -1)
             try:
                 return self.vote_codes()
@@ -275,7 +275,7 @@ class Learner(ABC):
         return self._prepared.nbytes
 
     def _unfit(self) -> None:
-        """Take away what `fit` has set: it is of views or classes that are gone."""
+        """Drop what `fit` has set, when the views or classes that it is of are gone."""
         for name in [name for name in vars(self) if name.endswith("_")]:
             delattr(self, name)
         self.history_: list[float] = []
@@ -292,7 +292,7 @@ class Learner(ABC):
         return operator.vote(*self._used_labels(seen, operator), self._votes, UNITS, sign)
 
     def _opened(self, view: View) -> Observation | UnusableViewError:
-        """Prepare a view that is new; what makes it unusable is returned."""
+        """Prepare a new view; return the error that says why, where it cannot be used."""
         try:
             observation = self._prepare(view, self._read_usable(view))
         except UnusableViewError as why:
@@ -300,7 +300,7 @@ class Learner(ABC):
         return observation if observation.num_pairs else UnusableViewError(SEES_NOTHING)
 
     def _add(self, view: View, opened: Observation | UnusableViewError | None, total: Any = None) -> bool:
-        """Count a view, and add its votes if it is prepared, to a total if there is one; or say why it is of no use."""
+        """List a view, and add its votes, if it is prepared, to the `total` or else to the learner's; or reject it."""
         if isinstance(opened, UnusableViewError):
             self.rejected[view.name] = str(opened)
             return False
@@ -316,10 +316,10 @@ class Learner(ABC):
     def _of_each(
         self, work: Callable[[str, Observation], R], names: Iterable[str] | None, tick: Callable[[], None]
     ) -> Iterator[tuple[str, R]]:
-        """Give what is made of each prepared view, or of some of them, several at once; ticks before each.
+        """Give the name of each prepared view, or of some, and what `work` makes of it; `tick` is called before each.
 
-        Every second time the last view comes first: of a file that is larger than the memory that caches it, what was
-        read last is still there.
+        Several views are worked on at once. Every second time the last view comes first: of a file that is larger than
+        the memory that caches it, what was read last is still there.
         """
         names, self._turned = list(self.views if names is None else names), not self._turned
         names = names if self._turned else names[::-1]

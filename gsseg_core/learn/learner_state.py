@@ -57,7 +57,7 @@ _VIEW_VOTES = 2.0**24 * LIMITS.max_pixels  # votes of one view for one Gaussian,
 
 @dataclass(frozen=True, eq=False)
 class Learnt:
-    """Codes that a learner came to."""
+    """Class probabilities that a learner has found."""
 
     learner: str  # its name
     codes: np.ndarray  # (N, K) float32: class probabilities; a row of zeros where no labelled pixel saw the Gaussian
@@ -66,7 +66,7 @@ class Learnt:
     evidence: np.ndarray | None = None  # (N,) float32: px that the codes stand on; an older state does not say
 
     def carried(self, carry: Callable[[np.ndarray], np.ndarray]) -> Learnt:
-        """Take it along as a scene changes: `carry` does that to the rows of an array."""
+        """Return it for a scene that has changed; `carry` makes the rows of an array, (N, ...), those of now."""
         evidence = None if self.evidence is None else carry(self.evidence)
         return replace(self, codes=carry(self.codes), evidence=evidence)
 
@@ -202,7 +202,7 @@ class State:
                 raise UnfitError(f"array codes is of {codes.shape[1]} classes; expected 1 to {k}")
             check_shares("codes", codes)
             num_views = whole_number(entry["num_views"], "num_views of what was learnt", 0, _MOST_VIEWS)
-            learnt = Learnt(str(entry["learner"]), codes, num_views, temperature_of(entry), _read_px(file, n))
+            learnt = Learnt(str(entry["learner"]), codes, num_views, temperature_of(entry), _read_evidence(file, n))
         names, per_view, whole = class_names_of(header), header.get("ids") == PER_VIEW, header["format"] == WHOLE_RAYS
         return cls(votes, views, num_fused, names, learnt, living, per_view, whole)
 
@@ -233,7 +233,7 @@ def _read_votes(file: NpzArrays, shape: tuple[int, int], num_kept: int, num_fuse
     return votes
 
 
-def _read_px(file: NpzArrays, num_gaussians: int) -> np.ndarray | None:
+def _read_evidence(file: NpzArrays, num_gaussians: int) -> np.ndarray | None:
     """Read the evidence of what was learnt, (N,) float32, unless a version that did not keep it saved the state."""
     if "evidence" not in file.names:
         return None
@@ -249,7 +249,7 @@ def _read_view(file: NpzArrays, i: int, entry: dict[str, Any], num_classes: int)
         camera = Camera(str(entry["name"]), width, height, pose[0, :3, :3], pose[1])
         labels = file.expect(f"labels_{i}", np.int32, (height, width))
         if f"mass_{i}" in file.names:
-            view = View.from_seen(camera, SeenLabels(labels, _read_evidence(file, i, labels)))
+            view = View.from_seen(camera, SeenLabels(labels, _read_label_evidence(file, i, labels)))
         else:
             view = View.from_arrays(camera, labels)
         if "group" in entry:
@@ -261,7 +261,7 @@ def _read_view(file: NpzArrays, i: int, entry: dict[str, Any], num_classes: int)
     return view
 
 
-def _read_evidence(file: NpzArrays, i: int, labels: np.ndarray) -> LabelEvidence:
+def _read_label_evidence(file: NpzArrays, i: int, labels: np.ndarray) -> LabelEvidence:
     classes = file.expect(f"classes_{i}", np.int32, (None,))
     mass = file.expect(f"mass_{i}", np.float32, (int(labels.max()) + 1, len(classes)))
     supervised = file.expect(f"supervised_{i}", np.int32, (None,)) if f"supervised_{i}" in file.names else None

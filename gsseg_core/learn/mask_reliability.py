@@ -104,7 +104,7 @@ def largest_cells(counts: np.ndarray, count: int) -> list[tuple[int, int, int]]:
 
 
 class MaskChecker:
-    """Hold the masks of a fitted learner against what it predicts of them without learning from them.
+    """Compares the masks of a fitted learner with what it predicts of them without learning from them.
 
     Parameters
     ----------

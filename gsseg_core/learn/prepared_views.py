@@ -16,7 +16,7 @@ MEMORY_BUDGET = 2 << 30  # bytes of them where the system does not say how much 
 
 R = TypeVar("R")
 
-_ALONE = threading.Lock()  # of two threads at work on a view each, one at a time keeps something
+_KEEPING = threading.Lock()  # held by the one thread that keeps a view, or an answer, at a time
 
 
 def default_budget(device: str = "cpu") -> int:
@@ -56,7 +56,7 @@ class PreparedViews:
 
     def keep(self, name: str, observation: Observation) -> None:
         """Keep a view, where there is room."""
-        with _ALONE:
+        with _KEEPING:
             size = observation.nbytes
             if self.nbytes[0] + size <= self._budget:
                 self.in_memory[name], self._sizes[name] = observation, size
@@ -73,10 +73,10 @@ class PreparedViews:
         return kept
 
     def ask(self, name: str, observation: Observation, work: Callable[[str, Observation], R]) -> R:
-        """Work with a view; what it is asked last is remembered of those that are in the file, too."""
+        """Work with a view; if it lies in the file, what `Observation.shares` answered last is kept beside it."""
         before, made = observation.answered, work(name, observation)
         if self._file.holds(name) and observation.answered is not before:
-            with _ALONE:
+            with _KEEPING:
                 self._answers.put(name, observation.answered)
         return made
 

@@ -42,6 +42,12 @@ _SMALLEST = np.finfo(np.float32).tiny
 _ROWS = 1 << 16  # of which powers are taken at a time
 
 
+def check_temperature(temperature: float) -> None:
+    """Raise `SettingsError` for what is no temperature."""
+    if not 0 < temperature < np.inf:
+        raise SettingsError(f"temperature is {temperature}; expected a number above 0")
+
+
 def tempered(
     shares: np.ndarray,  # (..., K) float32, not negative; a row sums to at most 1, up to rounding
     temperature: float,  # above 0
@@ -52,8 +58,7 @@ def tempered(
     array is returned; else no entry is above 1. Going to a temperature and then to its reciprocal leads back, up to
     rounding and to entries that are too small for the type. Raises `SettingsError` for what is no temperature.
     """
-    if not 0 < temperature < np.inf:
-        raise SettingsError(f"temperature is {temperature}; expected a number above 0")
+    check_temperature(temperature)
     if temperature == 1:
         return shares
     if shares.ndim != 2 or len(shares) <= _ROWS:

@@ -1,4 +1,4 @@
-"""States of old hold votes by rays that went on behind surfaces: they are cast anew, as far as masks are kept."""
+"""Votes in states of an older version, whose rays went on behind surfaces, are cast anew as far as masks are kept."""
 
 from __future__ import annotations
 
@@ -20,10 +20,10 @@ def votes_cast_anew(
     state: State, operator_of: Callable[[View], ViewOperator], used: Callable[[SeenLabels, ViewOperator], SeenLabels],
     units: float,
 ) -> np.ndarray:  # fmt: skip
-    """Return the votes of a state with those of the views that it keeps by rays that end at surfaces, (N, K) int64.
+    """Return the votes of a state, (N, K) int64; those of the views that it keeps by rays that end at surfaces.
 
-    Votes of views that are not kept stay as they are. What the kept ones had cast is taken from the sum; it is not what
-    was added bit for bit, so of a vote that nobody else has cast nothing is left.
+    Votes of views that are not kept stay as they are. Those that the kept views had cast are computed again and taken
+    from the sum. Rounding differs from when they were added, so what is left of a sum is 0 where it may be rounding.
     """
     all_kept = state.num_fused == len(state.views)
     left = np.zeros_like(state.votes) if all_kept else state.votes.copy()

@@ -18,7 +18,7 @@ from gsseg_core.segmentation import Segmentation
 
 @dataclass(frozen=True, eq=False)
 class Known:
-    """What a session knows at one moment; segmentations are made of it while the session goes on."""
+    """What a session knows at one moment, copied, so that it can be segmented while the session goes on."""
 
     scene: GaussianScene
     codes: np.ndarray  # (N, K) float32

@@ -99,7 +99,7 @@ class LiveSession:
 
     @property
     def era(self) -> object:
-        """Token of what is known: another one as soon as that is replaced, by `reset`, `load` or `retire`."""
+        """Token of all that is known; `reset`, `load` and `retire` begin another era, with another token."""
         return self._era
 
     @property
@@ -379,7 +379,7 @@ class LiveSession:
         return list(self._live.views.values())
 
     def _carrier(self) -> Callable[[Learnt], Learnt]:
-        """Return what brings that which is learnt of the session as it is now up to date, whenever it is called."""
+        """Return a function that fits what is learnt of the session as it is now to what it is when that is called."""
         return lambda learnt: learnt
 
     def _grow_for(self, view: View) -> None:

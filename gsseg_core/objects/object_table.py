@@ -281,7 +281,7 @@ class ObjectTable:
             self._profiles.add(self._lifted[name], objects)
 
     def _renumbered(self, solved: dict[str, np.ndarray]) -> tuple[dict[str, np.ndarray], np.ndarray]:
-        """Give solved objects the numbers that most of their weight had before; also return the successors."""
+        """Give solved objects the numbers that most of their weight had before; second come the successors."""
         from scipy.optimize import linear_sum_assignment
 
         names = sorted(self._objects)

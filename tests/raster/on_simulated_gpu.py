@@ -211,8 +211,8 @@ def step() -> dict[str, dict[str, np.ndarray]]:
         all_votes = votes.with_data(votes.data + int(300 * UNITS))
         pairs, here, total = (
             kernels.pairs_of(seen),
-            kernels.put_rows(codes, "cuda"),
-            kernels.put_rows(all_votes, "cuda"),
+            kernels.put(codes, "cuda"),
+            kernels.put(all_votes, "cuda"),
         )
         said = kernels.pair_likelihood(here, pairs, by_class)
         shares = kernels.shares(seen, said, by_class[:, 0]).pairs

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import TypeVar
+
 import numpy as np
 
 from gsseg_core.csr_rows import CSRRows
@@ -18,22 +20,23 @@ from gsseg_core.learn.em.leave_one_out import leave_one_out_counts, subtract_vot
 from gsseg_core.learn.em.scene_edges import edges_along
 from gsseg_core.raster.observation import Observation, VoteShares
 
+T = TypeVar("T")
+
 __all__ = [
     "accumulate", "by_row", "confusion_counts", "edges_along", "leave_one_out_counts", "m_step_without_view",
-    "pair_likelihood", "pairs_of", "put", "put_rows", "returned", "rows_like", "shares", "subtract_votes", "zeros",
+    "pair_likelihood", "pairs_of", "put", "returned", "rows_like", "shares", "subtract_votes", "zeros",
 ]  # fmt: skip
 
 
-def put(array: np.ndarray, device: str) -> np.ndarray:
-    """Put an array where the kernels work, which it is."""
+def put(values: T, device: str) -> T:
+    """Return an array, or rows, as they are: on the CPU, kernels work on them where they lie."""
     del device
+    return values
+
+
+def returned(array: np.ndarray) -> np.ndarray:
+    """Return an array that kernels have worked on as it is."""
     return array
-
-
-def put_rows(rows: CSRRows, device: str) -> CSRRows:
-    """Put rows there."""
-    del device
-    return rows
 
 
 def shares(observation: Observation, likelihood: np.ndarray, rest: np.ndarray) -> VoteShares:
@@ -41,11 +44,6 @@ def shares(observation: Observation, likelihood: np.ndarray, rest: np.ndarray) -
     return observation.shares(likelihood, rest)
 
 
-def returned(array: np.ndarray) -> np.ndarray:
-    """Return an array from there."""
-    return array
-
-
 def zeros(rows: CSRRows, kind: type[np.generic]) -> np.ndarray:
-    """Make an array of zeros, of as many as rows have entries."""
+    """Make one zero for each entry of some rows."""
     return np.zeros(len(rows.data), kind)

@@ -39,23 +39,19 @@ def by_row(pairs: PairTensors) -> PairTensors:
     return pairs._replace(ids=torch.arange(len(pairs.ids), dtype=torch.int32, device=pairs.ids.device))
 
 
-def put(array: np.ndarray, device: str) -> torch.Tensor:
-    """Copy an array to the GPU."""
-    return on_device(array, find_gpu(device))
-
-
-def put_rows(rows: CSRRows, device: str) -> RowTensors:
-    """Copy rows to the GPU."""
-    return RowTensors.of(rows, find_gpu(device))
+def put(values: np.ndarray | CSRRows, device: str) -> torch.Tensor | RowTensors:
+    """Copy an array, or rows, to the GPU."""
+    gpu = find_gpu(device)
+    return RowTensors.of(values, gpu) if isinstance(values, CSRRows) else on_device(values, gpu)
 
 
 def returned(array: torch.Tensor) -> np.ndarray:
-    """Return an array from there."""
+    """Copy an array back from the GPU."""
     return to_cpu(array)
 
 
 def zeros(rows: RowTensors, kind: type[np.generic]) -> torch.Tensor:
-    """Make an array of zeros there, of as many as rows have entries."""
+    """Make one zero for each entry of some rows, on the GPU."""
     return torch.zeros(len(rows.data), dtype=_KINDS[kind], device=rows.indptr.device)
 
 

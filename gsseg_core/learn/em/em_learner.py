@@ -143,14 +143,9 @@ class EMLearner(Learner):
     _last_step_: Any = None
 
     def __init__(
-        self,
-        scene: GaussianScene,
-        num_classes: int,
-        settings: EMSettings | None = None,
-        *,
-        device: str = "cpu",
-        memory_budget: int | None = None,
-    ) -> None:
+        self, scene: GaussianScene, num_classes: int, settings: EMSettings | None = None, *,
+        device: str = "cpu", memory_budget: int | None = None,
+    ) -> None:  # fmt: skip
         super().__init__(scene, num_classes, device=device, memory_budget=memory_budget)
         self.settings = settings or EMSettings()
 
@@ -175,17 +170,17 @@ class EMLearner(Learner):
         settings = self.settings
         self._require_views()
         votes, tick = CSRRows.from_dense(self._votes), partial(progress, "em", 0, settings.max_steps)
+        # All neighbours of a scene are found once; while a GPU tests regions, the CPU is free for that.
         search = partial(find_neighbours, self.scene, settings.prior_k)
         with meanwhile(search, self.device) if settings.prior_weight else nullcontext():
             votes, rejected = self._reject_regions(votes, tick) if settings.rejects_regions else (votes, {})
         resolved = resolved_votes(votes, self._possible())
-        some_against, evidence = resolved is not votes, VOTE_UNIT * resolved.sums()
+        any_against, evidence = resolved is not votes, VOTE_UNIT * resolved.sums()
         self.observed_ = evidence > 0
         resolved, prior = resolved.united(self._spatial_prior(resolved, evidence))
-        # The votes are the first step; with the prior added, J is finite from the start. What is zero now is zero after
-        # every step, so the pattern of the probabilities stays, unless the prior is taken anew.
+        # The votes are the first step; with the prior added, J is finite from the start. What is zero now stays zero
+        # in every step, so that rows keep their classes, unless the prior is taken anew.
         codes = resolved.with_data(resolved.data.astype(np.float32) * np.float32(VOTE_UNIT) + prior.data).normalised()
-        counted = prior.data > 0
         self.history_ = history = list[float]()
         models = self._initial_error_models(votes, rejected, tick)
         pixels = sum(model.num_pixels for model in models.values())
@@ -194,9 +189,7 @@ class EMLearner(Learner):
         while len(history) < settings.max_steps:
             tick = partial(progress, "em", len(history), settings.max_steps)
             gradient, log_likelihoods = self._e_step(codes, models, tick)
-            log_likelihood = sum(log_likelihoods[name] for name in self.views)
-            log_prior = (prior.data[counted] * np.log(codes.data[counted])).sum(dtype=np.float64)
-            history.append((float(log_prior) + log_likelihood) / pixels)
+            history.append(self._lower_bound(codes, prior, log_likelihoods) / pixels)
             rounds[-1] += 1
             last_round = len(rounds) > settings.refits or not settings.errors
             tolerance = settings.tolerance * (1 if last_round else REFIT_FACTOR) * named**2 / pixels
@@ -209,9 +202,8 @@ class EMLearner(Learner):
             elif small:
                 self._refit_error_models(codes, gradient, prior.data, models, tick)
                 rounds.append(0)
-                if some_against:  # Then votes were a poor guess of what the neighbours are; EM knows better by now.
+                if any_against:  # Such votes say little of what the neighbours are; the probabilities know by now.
                     codes, gradient, prior = with_prior(codes, gradient, self._spatial_prior(codes, evidence))
-                    counted = prior.data > 0
             kernels.m_step(codes, gradient, prior.data)
             if self.converged_:
                 break
@@ -219,6 +211,12 @@ class EMLearner(Learner):
         self.codes_, self.error_models_ = codes.dense(self.num_classes), models
         self._finish()
         return self
+
+    def _lower_bound(self, codes: CSRRows, prior: CSRRows, log_likelihoods: Mapping[str, float]) -> float:
+        """J, in nats: the log-likelihood of all labels, and the log of the prior but for a constant."""
+        counted = prior.data > 0
+        log_prior = (prior.data[counted] * np.log(codes.data[counted])).sum(dtype=np.float64)
+        return float(log_prior) + sum(log_likelihoods[name] for name in self.views)
 
     def predict_without(self, view: View) -> np.ndarray:
         """Blend into a view the probabilities of a last step without its mask, (H, W, K) float32.
@@ -234,10 +232,11 @@ class EMLearner(Learner):
         return operator.strongest(codes, self.num_classes, background, grid, of, wanted=wanted)
 
     def _without(self, view: View, *, only_labelled: bool) -> tuple[CSRRows, np.ndarray | None, bool, ViewRenderer]:
-        """Take the last step of `fit` once more, without a view's mask: codes, and what to blend them with.
+        """Take the last step of `fit` again, without a view's mask; return what blends the outcome into the view.
 
-        If only its labelled pixels count, what they see is at hand, and the codes are those of these Gaussians, whose
-        ids come second; else of all. Third is told whether any code has a share of the background.
+        These are the codes, the ids of their Gaussians, whether any code has a share of the background, and the
+        operator. If only labelled pixels count, the codes are of the Gaussians that these see, and the operator is at
+        hand; else they are of all Gaussians, and the ids None.
         """
         model, observation, backend = self._model_of(view), self.observation(view.name), kernels_on(self.device)
         codes, gradient, background = self._last_step_
@@ -280,9 +279,9 @@ class EMLearner(Learner):
         return split_regions(seen) if settings.rejects_regions else seen
 
     def _reject_regions(self, votes: CSRRows, tick: Tick) -> tuple[CSRRows, dict[str, np.ndarray]]:
-        """Reject labels that the other views contradict; return the votes that are left, and by view which those are.
+        """Reject labels that the other views contradict; return the votes without them, and by view which they are.
 
-        What is rejected has no say against others: each is tested once more, by the votes that are left.
+        What is rejected must not speak against others: so each is tested once more, by the votes that are left.
         """
         rejected_votes, doubted = self._find_rejected(votes, tick, dict.fromkeys(self.views))
         left = votes.with_data(votes.data - rejected_votes)
@@ -294,7 +293,8 @@ class EMLearner(Learner):
     ) -> tuple[np.ndarray, dict[str, np.ndarray]]:
         """Find the labels of some views that the other views contradict, by the votes of all, int64.
 
-        For None, all labels of a view are tested, else those that are doubted, (L,) bool, which have no votes there.
+        Of a view that is None among the `doubted`, all labels are tested; else those marked, (L,) bool, whose votes are
+        not among the votes.
 
         Returns
         -------
@@ -319,7 +319,7 @@ class EMLearner(Learner):
         return -backend.returned(remaining), rejected
 
     def _device_of(self, votes: CSRRows) -> str:
-        """Where votes are counted: what is voted against, the CPU alone resolves."""
+        """Device that counts votes: those against a class are resolved on the CPU alone."""
         return "cpu" if votes.data.min(initial=0) < 0 else self.device
 
     def _initial_error_models(
@@ -345,7 +345,7 @@ class EMLearner(Learner):
         return {name: models[name] for name in (self.views if names is None else names)}
 
     def _e_step(self, codes: CSRRows, models: dict[str, ErrorModel], tick: Tick) -> tuple[np.ndarray, dict[str, float]]:
-        """Sum over the views of these models the gradient of the log-likelihood.
+        """Sum the gradient of the log-likelihood over the views of these models.
 
         Returns
         -------

@@ -19,16 +19,16 @@ def kernels_on(device: str) -> ModuleType:
 
 
 def rows_on(rows: CSRRows, device: str) -> tuple[Any, ModuleType]:
-    """Put rows on a device, and tell what works on them there."""
+    """Copy rows to a device; second comes the module whose functions work on them there."""
     backend = kernels_on(device)
-    return backend.put_rows(rows, device), backend
+    return backend.put(rows, device), backend
 
 
 def codes_without(
     observation: Observation, model: ErrorModel, codes: CSRRows, gradient: np.ndarray, prior: np.ndarray,
     device: str = "cpu",
 ) -> CSRRows:  # fmt: skip
-    """Take an M-step without one view: probabilities of the M Gaussians that it sees.
+    """Take an M-step without one view: class probabilities of the M Gaussians that it sees, M rows.
 
     The gradient is that of all views at these codes and models; see `gsseg_core.learn.em.em_kernels` for the arrays,
     which are on the device.

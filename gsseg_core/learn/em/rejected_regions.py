@@ -55,14 +55,14 @@ def find_rejected(
 ) -> np.ndarray:  # fmt: skip
     """Find the labels of a view that the votes of all other views contradict, (L,) bool; none of uncertain evidence.
 
-    They are those under which less than the share `least`, by weight, is of their class by the votes of the others, or
-    less than `RIVALLED` times `least` of what is of another class: an even mixture of many speaks less against a label
-    than one class all over. A Gaussian that this view saw better than all others together counts by what they saw of
-    it, no more: what shows through a gap in another view is little evidence. A region of which they saw too little is
-    kept.
+    By the votes of the others, each class has some weight under a label. The label is contradicted if its own class has
+    less than the share `least` of all that weight, or less than `RIVALLED` times `least` of what another class has: one
+    class all over speaks more against a label than an even mixture of many. A Gaussian counts for no more px than the
+    others saw of it: what shows through a gap in another view is little evidence. A region of which they saw too little
+    is kept.
 
-    If there are `doubted` labels, (L,) bool, they have no votes among these, and only they can be rejected. The other
-    parameters are those of `leave_one_out_counts`, with the votes on the device.
+    If there are `doubted` labels, (L,) bool, only they can be rejected, and their votes are not among the votes. The
+    other parameters are those of `leave_one_out_counts`, with the votes on the device.
     """
     evidence = observation.evidence
     if not evidence.is_certain:

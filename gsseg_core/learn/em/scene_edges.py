@@ -1,9 +1,9 @@
 """Edges of the scene in a view, of colour and of depth, to which boundaries of masks can be aligned.
 
 Their strength is the gradient of the luminance plus the second differences of the inverse depth, each in units of its
-95th percentile over the view, by a sample of it: edges are needed near boundaries of the mask, and only there, and in
-the sample, are they drawn. On a plane, inverse depth is linear in the image, so that only creases and steps are
-left. Depth alone is too blurred to locate boundaries: a scene of one colour has no edges.
+95th percentile, which is that of a sample of the view. Edges are rendered where they are needed alone: near boundaries
+of the mask, and in the sample. On a plane, inverse depth is linear in the image, so that its second differences are
+those of creases and steps. Depth alone is too blurred to locate boundaries: a scene of one colour has no edges.
 """
 
 from __future__ import annotations

@@ -1,10 +1,10 @@
 """Spatial prior of EM: objects are continuous in space, so a Gaussian is likely what its nearest neighbours are.
 
-What these are, the votes tell at first. With masks of some classes only, they tell it badly: each mask votes against
-the classes that it looked for and did not show. Where one is wrong about an object, and few others looked for that,
-more may speak against the right class than for it; the class is dropped, with the Gaussian's neighbours as with itself,
-and stays at zero in every step. Once EM has all but converged, it knows better than they do, and the prior is taken
-from its probabilities; by it, a class that some of the neighbours have kept comes back to the others.
+At first the votes say what the neighbours are. Votes of partial masks say it badly, since each of these votes against
+the classes that it looked for and does not show. Where one mask misses an object that few others looked for, the right
+class may get more votes against it than for it. It is then dropped, for the Gaussian and its neighbours alike, and
+stays at zero in every step. Once EM has all but converged, its probabilities are the better source, and the prior is
+taken from them: a class that some of the neighbours have kept then comes back to the others.
 """
 
 from __future__ import annotations
@@ -37,9 +37,9 @@ def spatial_prior(
 
 
 def with_prior(codes: CSRRows, gradient: np.ndarray, prior: CSRRows) -> tuple[CSRRows, np.ndarray, CSRRows]:
-    """Give codes and their gradient, (Z,), another prior: all in a pattern that has the classes of either.
+    """Give codes and their gradient, (Z,), another prior; all three then have the classes that either had.
 
-    What was not there is zero. The next M-step adds the prior to it, and from then on it has a share of its own.
+    Entries that are new are zero. The next M-step adds the prior to them, and from then on they count.
     """
     gradient = codes.with_data(gradient).united(prior)[0].data
     codes, prior = codes.united(prior)
