@@ -275,7 +275,7 @@ class Segmentation:
         Here refinement has no say. A Gaussian across an edge is rightly a mixture: neighbours decide to which object it
         goes, but the picture is sharper with what it learnt itself. One that the filter took out of its object still
         covers what is behind it. What a ray has left over is background, if any mask ever showed the background; else
-        nothing.
+        nothing. Raises `StateMismatchError` where the operator is of another scene, as all do that take one.
         """
         image = self.blend(operator)
         return RenderedLabels(self.class_ids[image.argmax(axis=2)], tempered(image, self.temperature).max(axis=2))
@@ -305,7 +305,7 @@ class Segmentation:
 
     def label_map(self, operator: ViewOperator) -> np.ndarray:
         """Class of every pixel of a view, (H, W) int32: those of `render`, without the confidence."""
-        codes, shows_background = self._codes_to_blend()
+        codes, shows_background = self._codes_to_blend(operator)
         return np.asarray(self.class_ids[operator.strongest(codes, len(self.class_names), shows_background).classes])
 
     def label_map_beside(self, operator: ViewOperator, others: np.ndarray) -> tuple[np.ndarray, Blended]:
@@ -313,7 +313,7 @@ class Segmentation:
 
         That is (M, C) of the operator's `ids`, such as their colours.
         """
-        codes, shows_background = self._codes_to_blend()
+        codes, shows_background = self._codes_to_blend(operator)
         found = operator.strongest(codes, len(self.class_names), shows_background, beside=others)
         assert found.beside is not None
         return self.class_ids[found.classes], found.beside
@@ -323,11 +323,12 @@ class Segmentation:
 
         `gsseg_core.learn.temperature.tempered` at `temperature` makes probabilities of them.
         """
-        codes, shows_background = self._codes_to_blend()
+        codes, shows_background = self._codes_to_blend(operator)
         return operator.blend_probabilities(codes, len(self.class_names), shows_background)
 
-    def _codes_to_blend(self) -> tuple[CSRRows, bool]:
+    def _codes_to_blend(self, operator: ViewOperator) -> tuple[CSRRows, bool]:
         """Codes as they were learnt, and whether any is of the background, to which then goes what rays leave over."""
+        self.require(operator.scene)
         with _FIRST_ONE:
             return self._blended
 

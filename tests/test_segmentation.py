@@ -142,6 +142,8 @@ def test_a_segmentation_is_neither_made_nor_used_with_another_scene(tmp_path: Pa
         lambda: result.carved(other, [view.camera]),
         lambda: result.carved_by(other, [view], lambda _: None),
         lambda: result.filtered(other, PAPER),
+        lambda: result.render(make_operator(other, view.camera)),
+        lambda: result.label_map(make_operator(other, view.camera).without(np.zeros(len(other), bool))),
     ):
         with pytest.raises(StateMismatchError, match=r"segmentation: belongs to the scene .* expected"):
             use()

@@ -66,7 +66,9 @@ def make_operator(scene: GaussianScene, camera: Camera, device: str = "cpu") -> 
     SettingsError
         There is no such device, or what it needs is not installed.
     """
-    return _module_of(device).view_operator(scene, camera, device)
+    operator: ViewOperator = _module_of(device).view_operator(scene, camera, device)
+    operator.scene = scene
+    return operator
 
 
 def free_memory_on(device: str) -> int | None:

@@ -10,9 +10,11 @@ import numpy as np
 from gsseg_core.data.label_evidence import LabelEvidence
 from gsseg_core.errors import MaskFormatError, SceneValueError, SettingsError
 from gsseg_core.files.limits import MAX_LABEL
+from gsseg_core.raster.constants import BLOCK
 from gsseg_core.raster.objects_alone import ObjectsAlone
 from gsseg_core.raster.observation import Observation, check_total
 from gsseg_core.raster.view_renderer import ViewRenderer
+from gsseg_core.scene.gaussian_scene import GaussianScene
 
 
 class Weights(NamedTuple):
@@ -30,7 +32,14 @@ class ViewOperator(ViewRenderer):
     A row of W sums to 1 minus the ray's final transmittance.
 
     Its `ids` come in an order of its own; all other Gaussians have a column of zeros.
+
+    Attributes
+    ----------
+    scene : GaussianScene
+        The scene that is seen.
     """
+
+    scene: GaussianScene
 
     def adjoint(self, residual: np.ndarray) -> np.ndarray:
         """Carry anything that a pixel carries, as labels or a loss's gradient, back to the Gaussians: W^T r.
@@ -74,8 +83,12 @@ class ViewOperator(ViewRenderer):
             The labels are not whole numbers, or larger than `MAX_LABEL`, or than there is evidence for.
         MaskSizeError
             The labels are not of the camera's size.
+        SceneValueError
+            The weights are of another shape, or not finite, or below 0.
         """
         self._check_labels(labels, evidence)
+        if weights is not None:
+            self._check_weights(weights)
         observation = self._observe(labels, weights)
         if evidence is not None:
             observation.evidence = evidence
@@ -192,6 +205,13 @@ class ViewOperator(ViewRenderer):
         observation = self.observe(labels, evidence)
         observation.vote(total, units, sign)
         return observation.num_pairs > 0
+
+    def _check_weights(self, weights: np.ndarray) -> None:
+        """Refuse what would be repeated over the image, or make every share NaN."""
+        expected = -(-self.camera.height // BLOCK), -(-self.camera.width // BLOCK)
+        if weights.shape != expected or not (weights.min() >= 0 and weights.max() < np.inf):
+            found = f"view '{self.camera.name}': weights have shape {weights.shape}, {weights.min(initial=np.inf)} to"
+            raise SceneValueError(f"{found} {weights.max(initial=-np.inf)}; expected {expected}, finite, 0 or more")
 
     def _check_labels(self, labels: np.ndarray, evidence: LabelEvidence | None) -> None:
         """Refuse what a kernel would take for places beyond its tables."""

@@ -23,6 +23,8 @@ def test_what_kernels_would_take_for_places_beyond_their_tables_is_refused():
             with pytest.raises(MaskFormatError, match=r"view 'view': labels are (int32|float64) up to .* expected"):
                 use(mask, evidence)
     seen = operator.observe(labels.astype(np.uint8))
+    with pytest.raises(SceneValueError, match=r"view 'view': votes have shape \(120,\), int64; expected \(120, 3\)"):
+        operator.vote(labels, None, np.zeros(120, np.int64), 1.0)
     for total in [np.zeros((5, 9), np.int64), np.zeros((120, 2), np.int64), np.zeros((120, 9), np.int32)]:
         with pytest.raises(SceneValueError, match=r"view 'view': votes have shape .* or more, int64"):
             seen.vote(total, 1.0)
@@ -38,6 +40,18 @@ def test_what_kernels_would_take_for_places_beyond_their_tables_is_refused():
     for use in (operator.blend_seen, lambda a, b: operator.strongest(codes, 3, True, beside=a, wanted=b)):
         with pytest.raises(MaskSizeError, match=r"wanted pixels have shape \(3, 3\); expected \(21, 37\)"):
             use(seen_codes, np.ones((3, 3), bool))
+
+
+@pytest.mark.parametrize(
+    "weights", [np.ones((1, 1)), np.ones((6, 1)), np.ones((7, 10)), np.ones(60), np.full((6, 10), np.nan),
+                np.full((6, 10), -1.0), np.full((6, 10), np.inf)],
+)  # fmt: skip
+def test_weights_of_other_blocks_than_the_image_has_are_refused_and_not_repeated(backend, weights):
+    scene, camera = random_view(0)
+    operator, labels = backend.make(scene, camera), np.zeros((21, 37), np.int32)
+    with pytest.raises(SceneValueError, match=r"view 'view': weights have shape .*; expected \(6, 10\), finite, 0 or"):
+        operator.observe(labels, weights=weights.astype(np.float32))
+    assert operator.observe(labels, weights=np.ones((6, 10), np.float32)).weighted_areas == 21 * 37
 
 
 def test_codes_of_another_scene_are_refused(backend):
