@@ -19,6 +19,7 @@ from gsseg_core.data.view import spread
 from gsseg_core.errors import SettingsError, StateMismatchError
 from gsseg_core.files.limits import MAX_LABEL
 from gsseg_core.files.npz_files import (
+    COLDEST,
     UnfitError,
     check_evidence,
     check_shares,
@@ -28,7 +29,7 @@ from gsseg_core.files.npz_files import (
     write_npz,
 )
 from gsseg_core.files.run_folder import settle
-from gsseg_core.learn.temperature import check_temperature, tempered
+from gsseg_core.learn.temperature import tempered
 from gsseg_core.raster.view_operator import ViewOperator
 from gsseg_core.raster.view_renderer import Blended
 from gsseg_core.refine.knn_filter import cluster_in_place, statistical_filter
@@ -169,9 +170,10 @@ class Segmentation:
         """Bring all probabilities to a temperature, as `gsseg_core.learn.calibrate` fits it; labels and pictures stay.
 
         What blends into a view are always the shares that were learnt; a pixel's probability is what they blend to, at
-        this temperature, above 0; else `SettingsError`.
+        this temperature, from 0.001 to 1000, as files hold it; else `SettingsError`.
         """
-        check_temperature(temperature)
+        if not COLDEST <= temperature <= 1 / COLDEST:
+            raise SettingsError(f"temperature is {temperature}; expected a number from {COLDEST:g} to {1 / COLDEST:g}")
         change = temperature / self.temperature
         return replace(self, probabilities=tempered(self.probabilities, change), temperature=temperature)
 

@@ -25,10 +25,10 @@ SCENE, TRUTH = balls_on_a_table()
 CODES = np.eye(NUM_CLASSES, dtype=np.float32)[TRUTH]
 
 
-@pytest.mark.parametrize("temperature", [0.0, -1.0, float("nan"), float("inf")])
+@pytest.mark.parametrize("temperature", [0.0, -1.0, float("nan"), float("inf"), 1e-300, 1e300])
 def test_a_temperature_that_is_none_is_refused(temperature: float) -> None:
     codes = np.eye(NUM_CLASSES, dtype=np.float32)[TRUTH]
-    with pytest.raises(SettingsError, match=r"temperature is .*; expected a number above 0"):
+    with pytest.raises(SettingsError, match=r"temperature is .*; expected a number from 0.001 to 1000"):
         Segmentation.from_codes(SCENE, codes, NAMES).calibrated(temperature)
     with pytest.raises(SettingsError, match=r"temperature is .*; expected a number above 0"):
         tempered(codes, temperature)

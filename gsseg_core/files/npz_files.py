@@ -25,7 +25,9 @@ from gsseg_core.text import clipped, quoted
 SHARES_TOLERANCE = 0.01
 """By how much probabilities of a row may sum to more or less than 1."""
 
-_COLDEST = 1e-3  # lowest temperature of probabilities; the highest is one over it
+COLDEST = 1e-3
+"""Lowest temperature of probabilities; the highest is one over it."""
+
 _SUFFIX = ".npy"
 _HEADERS = {(1, 0): np.lib.format.read_array_header_1_0, (2, 0): np.lib.format.read_array_header_2_0}
 
@@ -129,8 +131,8 @@ def whole_number(value: object, what: str, least: int, most: int) -> int:
 def temperature_of(header: dict[str, Any]) -> float:
     """Read the temperature of probabilities from a JSON header; 1 where there is none, as in files of old."""
     value = header.get("temperature", 1.0)
-    if type(value) not in (int, float) or not _COLDEST <= value <= 1 / _COLDEST:
-        raise UnfitError(f"temperature is {quoted(value)}; expected a number from {_COLDEST:g} to {1 / _COLDEST:g}")
+    if type(value) not in (int, float) or not COLDEST <= value <= 1 / COLDEST:
+        raise UnfitError(f"temperature is {quoted(value)}; expected a number from {COLDEST:g} to {1 / COLDEST:g}")
     return float(value)
 
 

@@ -39,10 +39,10 @@ class GradientSettings:
 
     def __post_init__(self) -> None:
         """Validate."""
-        if self.epochs < 1 or not 0 < self.final_rate <= self.rate:
+        if self.epochs < 1 or not 0 < self.final_rate <= self.rate < np.inf:
             raise SettingsError(
                 f"gradient: epochs is {self.epochs}, rate {self.rate}, final_rate {self.final_rate}; "
-                "expected at least one epoch and 0 < final_rate <= rate"
+                "expected at least one epoch and 0 < final_rate <= rate, finite"
             )
 
 

@@ -14,6 +14,7 @@ import numpy as np
 from gsseg_core.data.soft_masks import SeenLabels
 from gsseg_core.data.view import View
 from gsseg_core.errors import NoUsableViewsError, SettingsError, StateMismatchError, UnknownLabelError
+from gsseg_core.files.limits import MAX_LABEL
 from gsseg_core.learn.em.em_kernels import normalise_votes, weigh_votes
 from gsseg_core.learn.learner_state import State
 from gsseg_core.learn.prepared_views import PreparedViews, default_budget
@@ -42,6 +43,11 @@ _VOTES_LENT = threading.Lock()  # held while a view's votes are taken out of the
 
 class UnusableViewError(Exception):
     """A view that nothing can be learnt from; the message says why, in the words above."""
+
+
+def _check_num_classes(num_classes: int) -> None:
+    if not isinstance(num_classes, int | np.integer) or not 1 <= num_classes <= MAX_LABEL + 1:
+        raise SettingsError(f"num_classes is {num_classes}; expected a whole number from 1 to {MAX_LABEL + 1}")
 
 
 class Learner(ABC):
@@ -90,8 +96,7 @@ class Learner(ABC):
     def __init__(
         self, scene: GaussianScene, num_classes: int, *, device: str = "cpu", memory_budget: int | None = None
     ) -> None:
-        if num_classes < 1:
-            raise SettingsError(f"num_classes is {num_classes}; expected at least 1")
+        _check_num_classes(num_classes)
         memory_budget = default_budget(device) if memory_budget is None else memory_budget
         if memory_budget < 0:
             raise SettingsError(f"memory_budget is {memory_budget} bytes; expected at least 0")
@@ -170,6 +175,7 @@ class Learner(ABC):
 
         Votes for others are gone, and so is what `fit` has learnt of them.
         """
+        _check_num_classes(num_classes)
         shrinks = num_classes < self.num_classes
         if shrinks and num_classes <= (largest := max([0, *(view.largest_label for view in self.views.values())])):
             raise SettingsError(f"num_classes is {num_classes}; expected more than {largest}, which a view shows")

@@ -38,14 +38,8 @@ RIGHT = 0.3
 OUTLIERS = 1e-3  # share of pixels that carry any label of the view by chance
 _PRECISION = 0.02  # of the logarithm of the temperature
 _TINY = 1e-12
-_SMALLEST = np.finfo(np.float32).tiny
+_SMALLEST = float(np.finfo(np.float32).tiny)
 _ROWS = 1 << 16  # of which powers are taken at a time
-
-
-def check_temperature(temperature: float) -> None:
-    """Raise `SettingsError` for what is no temperature."""
-    if not 0 < temperature < np.inf:
-        raise SettingsError(f"temperature is {temperature}; expected a number above 0")
 
 
 def tempered(
@@ -58,7 +52,8 @@ def tempered(
     array is returned; else no entry is above 1. Going to a temperature and then to its reciprocal leads back, up to
     rounding and to entries that are too small for the type. Raises `SettingsError` for what is no temperature.
     """
-    check_temperature(temperature)
+    if not _SMALLEST < temperature < 1 / _SMALLEST:
+        raise SettingsError(f"temperature is {temperature}; expected a number above 0 that float32 can hold")
     if temperature == 1:
         return shares
     if shares.ndim != 2 or len(shares) <= _ROWS:

@@ -374,7 +374,8 @@ def test_fitting_twice_gives_the_same_bits() -> None:
 @pytest.mark.parametrize(
     "wrong",
     [{"max_steps": 0}, {"prior_k": 0}, {"outliers": 0.0}, {"outliers": 1.0}, {"tolerance": -1.0},
-     {"error_prior": -0.1}, {"prior_weight": -1.0}],
+     {"error_prior": -0.1}, {"prior_weight": -1.0}, {"max_steps": 2.5}, {"edge_px": 1.5}, {"tolerance": np.nan},
+     {"majority": np.nan}, {"prior_weight": np.inf}],
 )  # fmt: skip
 def test_settings_out_of_range_are_refused_by_name(wrong: dict[str, float]) -> None:
     with pytest.raises(SettingsError, match=f"em: .*{next(iter(wrong))}.*expected"):

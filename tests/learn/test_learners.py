@@ -306,8 +306,11 @@ def test_a_label_beyond_the_classes_is_refused_and_changes_nothing() -> None:
 
 
 def test_impossible_requests_are_refused() -> None:
-    with pytest.raises(SettingsError, match="num_classes is 0; expected at least 1"):
-        VoteLearner(SCENE, 0)
+    for count in (0, 4.0, 65536, 10**12):  # Memory for so many votes there is nowhere.
+        with pytest.raises(SettingsError, match=rf"num_classes is {count}; expected a whole number from 1 to 65535"):
+            VoteLearner(SCENE, count)  # type: ignore[arg-type]
+        with pytest.raises(SettingsError, match=rf"num_classes is {count}; expected a whole number from 1 to 65535"):
+            VoteLearner(SCENE, 2).resize(count)  # type: ignore[arg-type]
     learner, state = VoteLearner(SCENE, 2), taught(VoteLearner(SCENE, NUM_CLASSES), VIEWS).state()
     with pytest.raises(StateMismatchError, match="state is of 626 Gaussians; expected 600, as the scene has"):
         EMLearner(SCENE.subset(np.arange(600)), NUM_CLASSES).adopt(state)

@@ -213,5 +213,5 @@ def test_votes_by_region_are_the_votes() -> None:
 def test_settings_out_of_range_are_refused() -> None:
     with pytest.raises(SettingsError, match=r"least_agreement is 1.5; expected a share in \[0, 1\]"):
         EMSettings(least_agreement=1.5)
-    with pytest.raises(SettingsError, match=r"majority is 0.5; expected at least 1"):
+    with pytest.raises(SettingsError, match=r"majority is 0.5; expected 1 or more"):
         EMSettings(majority=0.5)

@@ -104,17 +104,17 @@ class EMSettings:
 
     def __post_init__(self) -> None:
         """Validate."""
-        if self.max_steps < 1 or self.prior_k < 1:
-            raise SettingsError(f"em: max_steps is {self.max_steps}, prior_k {self.prior_k}; expected at least 1")
+        for name, least in (("max_steps", 1), ("prior_k", 1), ("refits", 0), ("edge_px", 0)):
+            value = getattr(self, name)
+            if not isinstance(value, int | np.integer) or value < least:
+                raise SettingsError(f"em: {name} is {value}; expected a whole number, {least} or more")
         if not 0 < self.outliers < 1:
             raise SettingsError(f"em: outliers is {self.outliers}; expected a share in (0, 1)")
         if not 0 <= self.least_agreement <= 1:
             raise SettingsError(f"em: least_agreement is {self.least_agreement}; expected a share in [0, 1]")
-        if self.majority < 1:
-            raise SettingsError(f"em: majority is {self.majority}; expected at least 1")
-        for name in ("tolerance", "error_prior", "prior_weight", "refits", "edge_px"):
-            if getattr(self, name) < 0:
-                raise SettingsError(f"em: {name} is {getattr(self, name)}; expected 0 or more")
+        for name, least in (("majority", 1), ("tolerance", 0), ("error_prior", 0), ("prior_weight", 0)):
+            if not least <= getattr(self, name) < np.inf:
+                raise SettingsError(f"em: {name} is {getattr(self, name)}; expected {least} or more, finite")
 
     @property
     def rejects_regions(self) -> bool:
