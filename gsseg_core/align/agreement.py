@@ -205,7 +205,7 @@ class _Window(NamedTuple):
         """Cut the square out of the camera's image, (S, S); black where it shows nothing."""
         size = self.camera.width, self.camera.height
         averages = resampling != Image.Resampling.NEAREST
-        shrunk = max(1, int((self.box[2] - self.box[0]) / size[0])) if averages else 1
+        shrunk = max(1, int(min((self.box[2] - self.box[0]) / size[0], max(image.size)))) if averages else 1
         box = tuple(edge / shrunk for edge in self.box)
         return np.asarray(image.reduce(shrunk).transform(size, Image.Transform.EXTENT, box, resampling))
 

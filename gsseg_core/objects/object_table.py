@@ -11,7 +11,7 @@ import numpy as np
 from gsseg_core.data.class_names import BACKGROUND_NAME
 from gsseg_core.data.label_images import UNKNOWN
 from gsseg_core.data.view import View
-from gsseg_core.errors import UnknownLabelError
+from gsseg_core.errors import SceneValueError, SettingsError, UnknownLabelError
 from gsseg_core.files.limits import MAX_LABEL
 from gsseg_core.objects.association import AssociationSettings, associate
 from gsseg_core.objects.lifted_segments import Lifted, Profiles, sums
@@ -145,12 +145,19 @@ class ObjectTable:
         self._largest = max(self._largest, number)
 
     def recall(self, votes: np.ndarray) -> None:
-        """Have the votes of views that are gone, (N, K) in px, count for `match`, as those of views that it forgot."""
+        """Have the votes of views that are gone, (N, K) in px, count for `match`, as those of views that it forgot.
+
+        Raises `SceneValueError` for votes of another shape, or that are not finite.
+        """
+        if votes.ndim != 2 or len(votes) != len(self.scene) or not np.isfinite(votes).all():
+            found = f"votes have shape {votes.shape}, {votes.min(initial=0)} to {votes.max(initial=0)}"
+            raise SceneValueError(f"objects: {found}; expected ({len(self.scene)}, K), finite")
         self._forgotten = Profiles.of(votes, self.settings.kept)
         self._fill()
 
     def remove(self, name: str) -> None:
-        """Take a view back, with all its evidence."""
+        """Take a view back, with all its evidence; raises `SettingsError` where there is no such view."""
+        self._require(name)
         del self.views[name]
         self._lifted.pop(name, None)
         if self._objects.pop(name, None) is not None:
@@ -171,7 +178,8 @@ class ObjectTable:
         self.views[view.name] = view
 
     def forget(self, name: str) -> None:
-        """Drop a view; its evidence still counts for `match`, but no longer for `solve`."""
+        """Drop a view; its evidence still counts for `match`, but no longer for `solve`. Raises as `remove` does."""
+        self._require(name)
         if name in self._lifted:
             self._forgotten.add(self._lifted.pop(name), self._objects.pop(name))
         del self.views[name]
@@ -247,6 +255,10 @@ class ObjectTable:
             "views": views,
             **({} if tree is None else {"tree": tree.describe(result.class_names, tree.sizes(result.labels))}),
         }
+
+    def _require(self, name: str) -> None:
+        if name not in self.views:
+            raise SettingsError(f"view {name!r} was not added; there are {len(self.views)} others")
 
     def _lift(self, view: View) -> tuple[Lifted, Observation] | None:
         """Lift the segments of a view to the Gaussians; None where it has no labels or sees no Gaussian."""

@@ -11,8 +11,10 @@ from collections.abc import Iterator
 import numpy as np
 import numpy.typing as npt
 
+from gsseg_core.errors import SettingsError
+
 OPAQUE = 0.1  # opacity from which on a Gaussian is solid
-_MOST_PER_AXIS = 64  # samples of an ellipsoid
+_MOST_SAMPLES = 1 << 18  # of an ellipsoid, about: enough for a wall that is 128 cells from its middle to each side
 _AT_ONCE = 1 << 20  # so many samples at a time, to keep memory small
 
 
@@ -25,8 +27,11 @@ def occupied_cells(
 ) -> npt.NDArray[np.float32]:
     """Find the cells, squares of a size along x and y from the origin on, that ellipsoids stand above, (M, 3).
 
-    Of each cell the middle, and the lowest height between the two at which it is occupied; by cell, x before y.
+    Of each cell the middle, and the lowest height between the two at which it is occupied; by cell, x before y. Raises
+    `SettingsError` for a size that is none.
     """
+    if not 0 < size < np.inf:
+        raise SettingsError(f"size of a cell is {size}; expected a number above 0")
     keys, heights = [np.empty((0, 2), np.int64)], [np.empty(0)]
     for points in _samples(np.asarray(means, np.float64), np.asarray(half_axes, np.float64), size):
         points = points[(points[:, 2] >= low) & (points[:, 2] <= high)]
@@ -53,10 +58,13 @@ def _samples(
     half_axes: npt.NDArray[np.float64],  # (N, 3, 3)
     size: float,
 ) -> Iterator[npt.NDArray[np.float64]]:
-    """Points (n, 3) of the ellipsoids, less than a cell apart along each axis; some ellipsoids at a time."""
+    """Points (n, 3) of the ellipsoids, some at a time; less than a cell apart along each axis, unless too many."""
     lengths = np.linalg.norm(half_axes, axis=1)  # (N, 3)
     # Powers of two: few different grids, each for many ellipsoids at once.
-    counts = 2 ** np.ceil(np.log2(np.maximum(2 * lengths / size, 1))).clip(max=np.log2(_MOST_PER_AXIS)).astype(np.int64)
+    powers = np.ceil(np.log2(np.maximum(2 * lengths / size, 1)))
+    while (many := powers.sum(axis=1, keepdims=True) > np.log2(_MOST_SAMPLES)).any():
+        powers = np.where(many, np.minimum(powers, powers.max(axis=1, keepdims=True) - 1), powers)
+    counts = 2 ** powers.astype(np.int64)
     for count in np.unique(counts, axis=0):
         sides = [(2 * np.arange(n) + 1) / n - 1 for n in count.tolist()]
         grid = np.stack(np.meshgrid(*sides, indexing="ij"), axis=-1).reshape(-1, 3)

@@ -43,6 +43,7 @@ ENOUGH = 0.999  # a turn has to make the rectangle smaller than this part of it;
 SAMPLE = 2000  # so many Gaussians of an object are looked at, at most, taken at even steps: that bounds the time
 _TIED = 1e-9  # areas and volumes that differ by less than this part of them differ by rounding
 _STEPS, _PASSES, _SIDES = 50, 4, 3  # of the median, at most; over the axes, at most; faces that a box is tried on
+_MOST = 1e100  # of a mean, covariance or weight: products of two of them are finite
 _SETTLED = 1e-3  # the median may still move by this part of the largest distance: it only has to lie inside
 
 
@@ -98,7 +99,7 @@ def oriented_box(
     covariances: np.ndarray,  # (M, 3, 3): in squared units
     weights: np.ndarray,  # (M,): what each counts, from 0; if all are 0, all count the same
 ) -> OrientedBox:
-    """Put a box around some Gaussians; the module says how. Raises `SceneValueError` for other shapes, or none."""
+    """Put a box around some Gaussians; the module says how. Raises `SceneValueError` for other shapes or values."""
     count = len(means)
     shapes = (np.shape(means), np.shape(covariances), np.shape(weights))
     if count == 0 or shapes != ((count, 3), (count, 3, 3), (count,)):
@@ -107,6 +108,11 @@ def oriented_box(
         )
     every = -(-count // SAMPLE)
     points, shape, weights = (np.asarray(values[::every], np.float64) for values in (means, covariances, weights))
+    if not all(np.abs(values).max() < _MOST for values in (points, shape, weights)) or weights.min() < 0:
+        raise SceneValueError(
+            f"box: means, covariances or weights are NaN, or beyond {_MOST:g}, or weights are below 0; expected finite "
+            "numbers, and weights from 0"
+        )
     if not weights.any():
         weights = np.ones(len(points))
     kept = without_floaters(points, weights)

@@ -143,6 +143,13 @@ def test_a_focal_length_of_next_to_nothing_does_no_harm() -> None:
     assert np.isfinite(shown.edges).all() and np.isfinite(shown.camera.K).all()
 
 
+@pytest.mark.parametrize("focal", [(1e38, 1e-38), (1e12, 1e-12), (1e-38, 1e38), (1e308, 1e308), (1e-308, 1e-308)])
+def test_no_focal_length_ends_in_an_error_of_pillow(focal: tuple[float, float]) -> None:
+    camera = Camera("v", 64, 48, np.array([[focal[0], 0, 32], [0, focal[1], 24], [0, 0, 1]]), np.eye(4))
+    shown = look_at([View.from_arrays(camera, np.arange(64 * 48).reshape(48, 64) % 3)], AlignSettings())
+    assert len(shown) == 1 and np.isfinite(shown[0].edges).all()
+
+
 def test_turning_a_picture_is_turning_its_camera(demo: Path, scene: GaussianScene) -> None:
     camera = look_at(Dataset(demo).views(), SETTINGS)[0].camera
     quarter = np.array([[0.0, -1, 0], [1, 0, 0], [0, 0, 1]])

@@ -28,7 +28,7 @@ from gsseg_core.cli.main import main
 from gsseg_core.data.dataset import Dataset
 from gsseg_core.data.label_images import UNKNOWN, read_mask, write_mask
 from gsseg_core.data.view import View
-from gsseg_core.errors import SettingsError
+from gsseg_core.errors import SceneValueError, SettingsError
 from gsseg_core.learn.em.em_learner import EMLearner
 from gsseg_core.objects.association import AssociationSettings, associate
 from gsseg_core.objects.depth_edges import Borders
@@ -50,6 +50,18 @@ def test_shuffled_ids_give_the_objects_that_true_ids_give() -> None:
         found = (part.relabelled(part.views[view.name]).read_labels() for part in (table, true))
         np.testing.assert_array_equal(*found)
     assert table.class_names == {0: "background", 1: "object_001", 2: "object_002", 3: "object_003"}
+
+
+@pytest.mark.parametrize("votes", [np.full((len(SCENE), 2), np.nan), np.full((len(SCENE), 2), np.inf), np.ones((3, 2))])
+def test_views_that_are_not_there_and_votes_that_are_none_are_refused_and_nothing_changes(votes: np.ndarray) -> None:
+    table = ObjectTable(SCENE)
+    before = table.match(VIEWS[0]).read_labels()
+    for use in (table.remove, table.forget):
+        with pytest.raises(SettingsError, match="view 'nowhere' was not added; there are 1 others"):
+            use("nowhere")
+    with pytest.raises(SceneValueError, match=r"objects: votes have shape .*; expected \(626, K\), finite"):
+        table.recall(votes)
+    np.testing.assert_array_equal(table.relabelled(VIEWS[0]).read_labels(), before)
 
 
 def test_what_is_found_does_not_depend_on_the_order_of_the_views() -> None:

@@ -153,6 +153,17 @@ def test_no_gaussian_and_shapes_that_do_not_fit_are_errors() -> None:
         oriented_box(np.zeros((4, 3)), np.zeros((4, 3, 3)), np.zeros(3))
 
 
+@pytest.mark.parametrize("value", [np.nan, np.inf, -1e200, -1.0])
+@pytest.mark.parametrize("what", ["means", "covariances", "weights"])
+def test_what_is_no_number_of_a_scene_is_one_clear_error(what: str, value: float) -> None:
+    given = {"means": cuboid(20), "covariances": np.tile(np.eye(3), (20, 1, 1)), "weights": np.ones(20)}
+    given[what][3] = value
+    if value == -1.0 and what != "weights":
+        return
+    with pytest.raises(SceneValueError, match="box: means, covariances or weights are NaN, or beyond 1e"):
+        oriented_box(**given)
+
+
 def test_a_large_object_is_judged_by_a_sample() -> None:
     points = cuboid(50_000) @ rotation(2).T
     np.testing.assert_allclose(box_around(points).size, SIZE, rtol=0.01)

@@ -7,6 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from gsseg_core.errors import SettingsError
 from gsseg_core.objects.occupied_cells import occupied_cells
 from gsseg_core.scene.quaternions import rotations
 
@@ -61,6 +62,19 @@ def test_a_wall_of_one_wide_gaussian_has_no_gap() -> None:
     along = np.unique(np.floor(cells[:, 0] / SIZE).astype(int))
     assert (np.diff(along) == 1).all() and along[0] <= -26 and along[-1] >= 25
     assert np.unique(cells[:, 1]) == pytest.approx(0.025)
+
+
+def test_a_wall_has_no_gap_however_many_cells_it_is_wide() -> None:
+    wall = np.diag([5.0, 0.01, 5.0])[None]
+    cells = occupied_cells(np.array([[0.0, 0.02, 1.0]]), wall, SIZE, 0.1, 1.8)
+    along = np.unique(np.floor(cells[:, 0] / SIZE).astype(int))
+    assert (np.diff(along) == 1).all() and along[0] <= -95 and along[-1] >= 94
+
+
+@pytest.mark.parametrize("size", [0.0, -0.05, float("nan"), float("inf")])
+def test_cells_of_no_size_are_refused(size: float) -> None:
+    with pytest.raises(SettingsError, match=r"size of a cell is .*; expected a number above 0"):
+        occupied_cells(np.zeros((1, 3)), np.eye(3)[None], size, 0.0, 1.0)
 
 
 def test_what_is_too_low_or_too_high_does_not_count() -> None:
