@@ -17,7 +17,6 @@ from gsseg_core import pipeline
 from gsseg_core.cli.main import main
 from gsseg_core.data.dataset import Dataset
 from gsseg_core.data.label_images import read_mask, write_mask
-from gsseg_core.data.view import View
 from gsseg_core.errors import UnknownLabelError
 from gsseg_core.learn.registry import make_learner
 from gsseg_core.raster.backends import make_operator
@@ -167,14 +166,11 @@ def test_soft_and_partial_masks_are_numbered_too(tmp_path: Path) -> None:
     assert set(np.unique(views["view1"].read_labels())) == {2}
 
 
-def test_workers_read_numbered_masks_from_their_own_files(tmp_path: Path) -> None:
-    from gsseg_core.learn.distributed.dask_learners import _by_path, _packed
-
+def test_workers_get_numbered_masks_as_they_are_read(tmp_path: Path) -> None:
     view = Dataset(with_gaps(tmp_path / "data")).numbered().views()[0]
-    for sent in (_by_path(view)[0], _packed(view)[0]):
-        assert isinstance(sent, View)
-        np.testing.assert_array_equal(sent.read_labels(), view.read_labels())
-        assert make_learner("votes", SCENE, 4).observe(sent)
+    sent = view.held()
+    np.testing.assert_array_equal(sent.read_labels(), view.read_labels())
+    assert sent.is_in_memory and make_learner("votes", SCENE, 4).observe(sent)
 
 
 def test_the_viewer_numbers_classes_and_saves_the_users_ids() -> None:

@@ -6,13 +6,15 @@ import itertools
 import json
 import os
 import re
+import shutil
 import signal
 import socket
 import subprocess
 import sys
 import threading
 import time
-from contextlib import nullcontext, suppress
+from contextlib import suppress
+from functools import partial
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -29,6 +31,7 @@ from gsseg_core.errors import MaskFormatError, SchedulerError
 from gsseg_core.learn.distributed import dask_cluster as scheduler
 from gsseg_core.learn.distributed.dask_learners import DistributedEM, DistributedVotes
 from gsseg_core.learn.em.em_learner import EMLearner
+from gsseg_core.learn.vote_learner import VoteLearner
 from gsseg_core.scene.gaussian_scene import GaussianScene
 
 
@@ -56,21 +59,30 @@ def test_the_command_gives_the_same_files_with_a_scheduler(address: str, data: P
         assert reports[0][key] == reports[1][key]
 
 
-@pytest.mark.parametrize("elsewhere", ["scene", "masks", "both"])
-def test_files_that_a_worker_has_not_or_has_different_are_sent(client: Any, data: Path, elsewhere: str) -> None:
+def test_a_scene_that_a_worker_has_not_or_has_different_is_sent(client: Any, data: Path) -> None:
     scene, views = GaussianScene.load(data / "scene.ply"), Dataset(data).views("train")
     here = taught(EMLearner(scene, NUM_CLASSES, SETTINGS), views)
-    if elsewhere != "masks":
-        balls_on_a_table(seed=1)[0].save(data / "scene.ply")
-    one = list(client.nthreads())[:1] if elsewhere != "scene" else []
-    with (
-        changed(client, one, "gsseg_core.learn.distributed.dask_worker", "digest_of", lambda path: "another")
-        if one
-        else nullcontext()
-    ):
-        there = DistributedEM(client, scene, NUM_CLASSES, SETTINGS)
-        there.observe_all(views)
-        assert_same(there, here)
+    balls_on_a_table(seed=1)[0].save(data / "scene.ply")
+    there = DistributedEM(client, scene, NUM_CLASSES, SETTINGS)
+    there.observe_all(views)
+    assert_same(there, here)
+
+
+def test_votes_are_taken_back_as_they_were_cast_whatever_became_of_the_file_of_the_mask(
+    client: Any, data: Path
+) -> None:
+    scene, views = GaussianScene.load(data / "scene.ply"), Dataset(data).views("train")
+    there, here = (
+        make(NUM_CLASSES) for make in (partial(DistributedVotes, client, scene), partial(VoteLearner, scene))
+    )
+    for learner in (there, here):
+        learner.observe_all(views)
+    shutil.copy(data / "labels/view3.png", data / "labels/view0.png")
+    (data / "labels/view1.png").unlink()
+    for learner in (there, here):
+        learner.retract("view1")
+        assert learner.observe(Dataset(data).views("train")[0])  # of the name view0, by the mask that is there now
+    assert_same(there, here)
 
 
 def test_a_broken_mask_is_one_clear_error_and_changes_nothing(

@@ -13,7 +13,6 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from concurrent.futures import CancelledError
-from dataclasses import replace
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
@@ -23,7 +22,7 @@ from gsseg_core.data.view import View
 from gsseg_core.errors import GssegError, SchedulerError
 from gsseg_core.learn.distributed import dask_worker
 from gsseg_core.learn.distributed.dask_cluster import PATIENCE, UNREACHABLE, check_workers, find_workers, name_of
-from gsseg_core.learn.distributed.dask_worker import NotHereError, Part, digest_of
+from gsseg_core.learn.distributed.dask_worker import Part
 from gsseg_core.learn.em.confusion_model import ErrorModel
 from gsseg_core.learn.em.em_learner import EMLearner
 from gsseg_core.learn.learner import Learner, Progress, UnusableViewError, silent
@@ -59,16 +58,17 @@ class _OnWorkers(Learner):
         self._scenes: dict[str, Future] = {}
         self._shares: list[_Share] = []
         self._dealt: tuple[dict[str, int], int] = {}, 0
-        self._by_path = self._direct = True
+        self._direct = True
 
     def observe(self, view: View) -> bool:
         """Add a view and its votes."""
         self.observe_all([view])
-        return self.views.get(view.name) is view
+        return view.name not in self.rejected
 
     def observe_all(self, views: Sequence[View], progress: Progress = silent) -> None:
         """Add views and their votes; after an error in one of them nothing has changed."""
-        named = {view.name: view for view in views}
+        # Whatever becomes of their files: what is taken back, or prepared anew, are the masks that have voted.
+        named = {view.name: view.held() for view in views}
         if named:
             votes, why = self._sum(dask_worker.sum_votes, named, lambda done: progress("observe", done, len(named)))
             for name, view in named.items():
@@ -143,8 +143,7 @@ class _OnWorkers(Learner):
         for worker, first, last in zip(workers, cuts, cuts[1:], strict=False):
             if first < last:
                 part = {name: views[name] for name in names[first:last]}
-                sent = [_by_path(view) if self._by_path else _packed(view) for view in part.values()]
-                shard = self._submit(worker, dask_worker.prepare, self._scenes[worker], sent, *settings)
+                shard = self._submit(worker, dask_worker.prepare, self._scenes[worker], list(part.values()), *settings)
                 self._shares.append(_Share(worker, shard, part))
         return self._shares
 
@@ -190,9 +189,6 @@ class _OnWorkers(Learner):
     def _check(self, future: Future) -> None:
         if future.status == "error":
             error = future.exception()
-            if isinstance(error, NotHereError):
-                self._by_path = False  # As for a scene, its place is looked for anew in any case.
-                raise _LostError from error
             if isinstance(error, GssegError):
                 raise error
             raise SchedulerError(
@@ -258,17 +254,3 @@ class DistributedEM(_OnWorkers, EMLearner):
         self, task: Callable[..., Part], tick: Callable[[], None], by_view: Mapping[str, Any] | None, *values: Any
     ) -> Part:
         return self._sum(task, self.views, lambda done: tick(), by_view, *values)
-
-
-def _by_path(view: View) -> tuple[View, str | None]:
-    """Make a view of which a worker reads the mask from its own files, if they are the same; its digest tells."""
-    if view.mask_path is not None and (digest := digest_of(view.mask_path)) is not None:
-        return replace(view, mask_path=view.mask_path.resolve()), digest
-    return _packed(view)  # A folder has no digest, so what it holds is sent.
-
-
-def _packed(view: View) -> tuple[View, None]:
-    """Make a view that has its mask with it, if there is one."""
-    if view.is_in_memory or not view.has_mask:
-        return view, None
-    return View.from_seen(view.camera, view.read_seen(), view.class_names), None

@@ -5,13 +5,11 @@ A task leaves its inputs as they are, so that it can be run again.
 
 from __future__ import annotations
 
-import hashlib
 import threading
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from copy import deepcopy
 from dataclasses import replace
-from pathlib import Path
 from typing import Any
 
 import numba
@@ -21,7 +19,6 @@ from numpy.lib.recfunctions import repack_fields
 from gsseg_core.csr_rows import CSRRows
 from gsseg_core.data.view import View
 from gsseg_core.errors import GssegError
-from gsseg_core.files.input_files import open_input
 from gsseg_core.learn.em.confusion_model import ErrorModel
 from gsseg_core.learn.em.em_learner import EMLearner, EMSettings
 from gsseg_core.learn.learner import UNITS, UnusableViewError
@@ -37,7 +34,7 @@ _BUSY = threading.Lock()
 
 
 class NotHereError(Exception):
-    """A worker does not have a file, or has another one under that path."""
+    """A worker does not have the scene under that path, or has another one there."""
 
 
 class Shard(EMLearner):
@@ -68,29 +65,15 @@ def geometry(scene: GaussianScene) -> GaussianScene:
     return replace(scene, vertices=repack_fields(scene.vertices[list(DC)]))
 
 
-def digest_of(path: Path) -> str | None:
-    """SHA-256 of a file, None if it cannot be read."""
-    try:
-        with open_input(path) as file:
-            return hashlib.file_digest(file, "sha256").hexdigest()
-    except OSError:
-        return None
-
-
 def prepare(
-    scene: GaussianScene, views: Sequence[tuple[View, str | None]], num_classes: int, settings: EMSettings | None,
+    scene: GaussianScene, views: Sequence[View], num_classes: int, settings: EMSettings | None,
     where: dict[str, Any],
 ) -> Shard:  # fmt: skip
-    """Prepare views; `NotHereError` where a mask's file is not the one with the digest beside the view.
-
-    The settings are those of votes if there are none; `where` is the learner's device and memory budget.
-    """
+    """Prepare views, by settings or, without, for votes; `where` is the learner's device and memory budget."""
     shard = Shard(scene, num_classes, settings or ONLY_VOTES, **where)
     shard._votes = shard._votes[:0].copy()
     with _all_threads():
-        for view, digest in views:
-            if digest is not None and view.mask_path is not None and digest_of(view.mask_path) != digest:
-                raise NotHereError(str(view.mask_path))
+        for view in views:
             opened = shard._opened(view)
             if isinstance(opened, UnusableViewError):
                 shard.rejected[view.name] = str(opened)
