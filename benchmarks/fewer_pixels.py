@@ -67,8 +67,9 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("scenes", nargs="*", type=Path)
     parser.add_argument("--made", type=Path)
+    options = parser.parse_args()
     print("| scene | masks |", " | ".join(QUALITIES), "|")
-    for root, labels, learn, truth in cases(parser.parse_args()):
+    for root, labels, learn, truth in cases(options):
         scene, names = GaussianScene.load(root / "scene.ply"), Dataset(root, labels).numbered().class_names
         found = [score(scene, learn, truth, max(names) + 1, step) for step in QUALITIES.values()]
         cells = (f"{100 * mean_iou:.1f} ({seconds:.0f} s)" for mean_iou, seconds in found)

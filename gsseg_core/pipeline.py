@@ -286,7 +286,8 @@ def render(
     placed = place(scene, dataset, align=align, dataparser=dataparser, device=device, progress=progress)
     views = placed.dataset.views(split)
     if not views:
-        raise NoUsableViewsError(f"{data}: split {split!r} has no views; expected at least one to render")
+        expected = "at least one to render; --split all renders every view"
+        raise NoUsableViewsError(f"{data}: split {split!r} has no views; expected {expected}")
     bits = 8 if max(ids) < 255 else 16  # 255 means unknown in masks of 8 bits
     names, overlays = [view_file_name(view.name) for view in views], []
     overview = ("contact_sheet.png", "legend.png")

@@ -191,7 +191,7 @@ class Segmentation:
         if granularity is None:
             return self
         if (tree := self.tree) is None:
-            raise SettingsError("granularity is for objects that were found from ids of each view's own; found no tree")
+            raise SettingsError("granularity needs objects that were found from ids of each view's own; found no tree")
         names = tree.names(self.class_names)
         # What blends into a view of a whole is the sum of what its objects do, as it was learnt.
         probabilities, nodes = tree.shares_at(granularity, self.calibrated(1.0).probabilities, tree.leaves)

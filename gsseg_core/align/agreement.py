@@ -86,7 +86,7 @@ class Agreement:
 
     def __str__(self) -> str:
         """Describe it for people."""
-        return f"{self.score:.2f} on {self.views} {self.compared}, {self.chance:.2f} by chance"
+        return f"agreement with {self.views} {self.compared} {self.score:.2f}, by chance {self.chance:.2f}"
 
 
 def look_at(views: Sequence[View], settings: AlignSettings) -> list[Shown]:

@@ -28,12 +28,12 @@ from gsseg_core.progress import progress_bars
 
 DESCRIPTION = """
 Prints the versions of gsseg, Python and its packages, the devices, whether the kernels run and where they are cached,
-the formats of scenes and cameras that are read, which options are installed, and what is there of ROS 2. For everything
-that is missing it says what to type. The exit code is 0 if gsseg works without the options, and 2 if not.
+the formats that are read, which extras are installed, and what there is of ROS 2. For all that is missing it says what
+to type. The exit code is 0 if gsseg works, with or without extras, and 2 if not.
 
-Given a scene, it says of that instead which format it has, and what this format keeps of a Gaussian. Given a dataset
-and --scene, it says whether the cameras of the one fit the other (exit code 0), and if not (2), which axes, scale,
-rotation and translation make them fit.
+Of a scene it prints its format instead, and what this format keeps of a Gaussian. Of a dataset with --scene it prints
+whether the cameras fit the scene (exit code 0), and if not (2), which axes, scale, rotation and translation make them
+fit.
 """
 EXAMPLES = """
   gsseg doctor
@@ -75,9 +75,9 @@ class Finding:
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare what the command takes."""
-    what = "say what this scene is, and not what the machine has; with --scene: a dataset, whose cameras are to fit it"
+    what = "a scene, to print its format; with --scene, a dataset, to see whether its cameras fit"
     parser.add_argument("path", nargs="?", metavar="PATH", help=what)
-    parser.add_argument("--scene", metavar="SCENE", help="trained scene that the cameras of a dataset are to fit")
+    parser.add_argument("--scene", metavar="SCENE", help="trained scene that cameras of the dataset PATH should fit")
     labels = "the dataset's folder of masks, which are looked at where there are no photos (default: labels)"
     parser.add_argument("--labels", default="labels", metavar="DIR", help=labels)
     add_dataparser(parser)
@@ -189,9 +189,9 @@ def _extras() -> Iterator[Finding]:
         missing = [name for name in names if not _version(name)]
         if missing:
             fix = f"pip install 'gsseg[{extra}]'"
-            yield Finding("options", extra, f"{purpose}: lacks {', '.join(missing)}", "-", fix)
+            yield Finding("extras", extra, f"{purpose}: lacks {', '.join(missing)}", "-", fix)
         elif names:
-            yield Finding("options", extra, purpose)
+            yield Finding("extras", extra, purpose)
 
 
 def _devices() -> Iterator[Finding]:

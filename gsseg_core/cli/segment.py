@@ -32,11 +32,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--labels", default=LABELS, metavar="PATH", help=labels)
     renames = "JSON that renames, merges and ignores classes of the masks, as in docs/formats.md"
     parser.add_argument("--label-map", metavar="FILE", help=renames)
-    parser.add_argument(
-        "--ids", choices=("global", "per-view"),
-        help="whether an id means the same in every view, or holds in its own view only (default: as the masks have)",
-    )  # fmt: skip
-    level = "per-view ids: what is written, from 0, objects put together, to 1, all their parts (default: the objects)"
+    ids = "an id means the same in every view, or holds in its own view only (default: as the format of the masks says)"
+    parser.add_argument("--ids", choices=("global", "per-view"), help=ids)
+    level = "per-view ids: the level to write, 0 (objects put together) to 1 (all their parts) (default: the objects)"
     parser.add_argument("--granularity", type=float, metavar="G", help=level)
     add = parser.add_argument_group("learning").add_argument
     add("--learner", choices=tuple(LEARNERS), default=DEFAULT, help="default: %(default)s")
@@ -58,7 +56,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     ways = "after KNN: cut objects to their silhouettes in the views, or filter outliers (default: %(default)s)"
     add("--refine", choices=("carve", "paper"), default="carve", help=ways)
     for name, effect in {
-        "--no-graph": "few views: leave what they hardly saw to KNN, without spreading codes",
+        "--no-graph": "few views: leave what they hardly saw to KNN, without label propagation",
         "--no-knn": "leave uncertain and unobserved Gaussians as they are",
         "--no-filter": "neither cut objects nor filter them",
     }.items():

@@ -68,7 +68,7 @@ class RunSettings:
         if self.granularity is not None:
             check_granularity(self.granularity)
             if self.ids not in (PER_VIEW, None):
-                raise SettingsError("granularity is for ids that are a view's own; expected ids per-view")
+                raise SettingsError("granularity needs masks with ids of each view's own; expected ids per-view")
         if self.quality not in QUALITIES:
             raise SettingsError(f"quality is {self.quality!r}; expected one of {', '.join(QUALITIES)}")
         check_format(self.scene_format)

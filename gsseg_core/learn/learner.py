@@ -29,6 +29,7 @@ from gsseg_core.raster.view_operator import ViewOperator
 from gsseg_core.raster.view_renderer import NO_PIXELS, PixelGrid, Strongest
 from gsseg_core.scene.gaussian_scene import GaussianScene
 from gsseg_core.several_at_once import each_with_made, several_at_once
+from gsseg_core.text import counted
 
 VOTE_UNIT = 2.0**-24  # votes are counted in whole multiples of this many px, so that adding and taking back are exact
 UNITS = 1 / VOTE_UNIT  # units per px
@@ -371,8 +372,9 @@ class Learner(ABC):
     def _require_views(self) -> None:
         """Raise `NoUsableViewsError` where there is no view to learn from."""
         if not self.views:
-            reasons = ", ".join(f"{count} {why}" for why, count in self.reject_summary().items()) or "none was given"
-            raise NoUsableViewsError(f"no view to learn from ({reasons}); expected posed views with label images")
+            reasons = [f"{why}: {counted(count, 'view')}" for why, count in self.reject_summary().items()]
+            why = ", ".join(reasons) or "none was given"
+            raise NoUsableViewsError(f"no view to learn from ({why}); expected posed views with label images")
 
     def _finish(self) -> None:
         """Clear codes without evidence, and impute those of Gaussians with votes only against classes."""

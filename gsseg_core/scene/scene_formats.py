@@ -137,9 +137,7 @@ def scene_hint(path: Path) -> str:
             # Trainers write point_cloud/iteration_30000/point_cloud.ply; the one of most steps is wanted.
             trained = sorted(path.glob("point_cloud/iteration_*"), key=lambda folder: (len(folder.name), folder.name))
             found = [scene for folder in (*trained, path) for scene in _scenes_in(folder)]
-            if not found:
-                return "; it is a folder without a scene"
-            return f"; it is a folder: type {shlex.quote(str(found[-1]))}"
+            return f"; type {shlex.quote(str(found[-1]))}" if found else "; no scene lies in it"
         if not path.exists():
             near = _scenes_in(path.parent)
             return f"; found {', '.join(file.name for file in near[:4])} in {path.parent}" if near else ""

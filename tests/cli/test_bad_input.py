@@ -103,10 +103,10 @@ BAD_INPUT: dict[str, tuple[Callable[[Path], object], str]] = {
     "mask broken": (lambda place: (place / "data/labels/view1.png").write_bytes(b"\x89PNG"), "view1.png"),
     "cameras that look elsewhere": (
         lambda place: edit_json(place / "data/cameras.json", turn_away),
-        "data: no view to learn from (4 sees no Gaussian); expected posed views with label images; cameras and scene "
-        "may be in different frames: try --align",
+        "data: no view to learn from (sees no Gaussian: 4 views); expected posed views with label images; cameras and "
+        "scene may be in different frames: try --align",
     ),
-    "no mask at all": (remove_masks, "data: no view to learn from (4 no mask)"),
+    "no mask at all": (remove_masks, "data: no view to learn from (no mask: 4 views)"),
 }  # fmt: skip
 
 
@@ -163,7 +163,8 @@ def test_render_and_eval_refuse_what_does_not_fit(place: Path, capsys: pytest.Ca
     assert_one_line(capsys.readouterr().err, "missing.npz")
     edit_json(place / "data/split.json", lambda split: split.update(test=[]))  # type: ignore[attr-defined]
     assert main(["render", scene, *rest, npz]) == 2
-    assert_one_line(capsys.readouterr().err, "data: split 'test' has no views")
+    says = "data: split 'test' has no views; expected at least one to render; --split all renders every view"
+    assert_one_line(capsys.readouterr().err, says)
     assert main(["eval", "--pred", f"{place}/maps", "--truth", f"{place}/data/labels"]) == 2
     assert_one_line(capsys.readouterr().err, "maps")
     assert not (place / "maps").exists()

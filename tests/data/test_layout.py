@@ -214,10 +214,10 @@ def test_a_folder_in_the_place_of_a_scene_leads_to_the_ply_of_most_steps(
         (data / f"model/point_cloud/iteration_{steps}").mkdir(parents=True)
         shutil.copy(data / "scene.ply", data / f"model/point_cloud/iteration_{steps}/point_cloud.ply")
     error = error_of(capsys, data, scene="model")
-    assert error.endswith(f"it is a folder: type {data}/model/point_cloud/iteration_30000/point_cloud.ply")
+    assert error.endswith(f"; type {data}/model/point_cloud/iteration_30000/point_cloud.ply")
     assert error_of(capsys, data, scene="scen.ply").endswith(f"found scene.ply in {data}")
     (data / "nothing").mkdir()
-    assert scene_hint(data / "nothing") == "; it is a folder without a scene"
+    assert scene_hint(data / "nothing") == "; no scene lies in it"
     assert scene_hint(data / "no/where/scene.ply") == ""
 
 

@@ -287,7 +287,7 @@ def test_no_view_left_is_one_clear_error_that_names_the_reasons(kind: type[Learn
         learner.fit()
     learner.observe(View(VIEWS[0].camera))
     learner.observe(View(VIEWS[1].camera))
-    with pytest.raises(NoUsableViewsError, match=r"no view to learn from \(2 no mask\); expected"):
+    with pytest.raises(NoUsableViewsError, match=r"no view to learn from \(no mask: 2 views\); expected"):
         learner.fit()
     learner.observe(VIEWS[2])
     learner.retract(VIEWS[2].name)
