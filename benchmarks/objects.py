@@ -162,28 +162,16 @@ def draw(
 
 TEXT = """# Objects cut out of the scene
 
-Made by `python benchmarks/objects.py`, which measures everything here again.
-Machine: {machine}.
+## The scene without an object
 
-Learnt by `em` from the train views, with true masks and with wrong ones (the demo's own, and `labels_noisy` of the
-others); scored in the {views} against the true masks. Settings were chosen on train views that were held out
-from learning, as `--held-out` does it.
+```bash
+gsseg remove scene.ply --segmentation out/segmentation.npz --class chair --out without_chair.ply
+```
 
-{table}
-
-![Objects of the demo, from wrong masks: without refinement, with the paper's, carved](pictures/objects_demo_wrong.png)
-
-## What is measured
-
-The silhouette of an object is where its own Gaussians, rendered alone, accumulate an alpha above 0.5. It is compared
-with the true mask of the object: IoU, and boundary IoU with bands as wide as 2 % of the image diagonal. Pixels are
-summed over the views per object; means are over all objects that the truth shows. The background is no object.
-
-A mask shows only what is visible of an object. So there are two scores, both by `benchmarks/object_scores.py`:
-
-- **visible**: a pixel of another label does not count where the object lies behind the surface of the scene, that is
-  where its depth is above that of the whole scene by more than 2 %. What sticks out in front or beside counts.
-- **whole**: every pixel counts. An object half hidden by others scores badly here, however clean it is.
+Writes a valid 3DGS PLY, or another [format](formats.md) by the suffix of `--out` or by `--format`; in Python it is
+`gsseg_core.objects.removal.without_objects`. The objects' PLYs and what is left make up the scene, Gaussian for
+Gaussian. What an object hid, no camera has seen: holes are left as they are.
+Gaussians that refinement took out of an object stay in the scene.
 
 ## What goes wrong, and what is done
 
@@ -221,6 +209,31 @@ the kitchen table's), with 0.3 it is 0.06 above, with 0.6 0.12 below. The whole 
 2608.30870) is not done: after carving, 4 to 40 Gaussians of each made-up scene are like that, and 500 to 1,300 of the
 apartment's. No way of weighing views, ends and axes that was tried gained visible IoU: 0.01 points at best.
 
+## What is measured
+
+The silhouette of an object is where its own Gaussians, rendered alone, accumulate an alpha above 0.5. It is compared
+with the true mask of the object: IoU, and boundary IoU with bands as wide as 2 % of the image diagonal. Pixels are
+summed over the views per object; means are over all objects that the truth shows. The background is no object.
+
+A mask shows only what is visible of an object. So there are two scores, both by `benchmarks/object_scores.py`:
+
+- **visible**: a pixel of another label does not count where the object lies behind the surface of the scene, that is
+  where its depth is above that of the whole scene by more than 2 %. What sticks out in front or beside counts.
+- **whole**: every pixel counts. An object half hidden by others scores badly here, however clean it is.
+
+## Scores
+
+Made by `python benchmarks/objects.py`, which measures everything here again.
+Machine: {machine}.
+
+Learnt by `em` from the train views, with true masks and with wrong ones (the demo's own, and `labels_noisy` of the
+others); scored in the {views} against the true masks. Settings were chosen on train views that were held out
+from learning, as `--held-out` does it.
+
+{table}
+
+![Objects of the demo, from wrong masks: without refinement, with the paper's, carved](pictures/objects_demo_wrong.png)
+
 ## How much there is to gain
 
 Three kinds of rows are no refinement, as they go by the truth:
@@ -236,17 +249,6 @@ What is lost in the demo is a rim less than a pixel wide around each object, sin
 at its outline, and from wrong masks some of the table at an object's foot. Little of that can be told from train views:
 by their true masks, which nobody has, carving would gain 0.3 points of visible IoU at most, and in the apartment 0.8
 from true masks and 1.9 from wrong ones; the best choice of Gaussians 0.1 to 0.7, and there 1.5 and 2.4.
-
-## The scene without an object
-
-```bash
-gsseg remove scene.ply --segmentation out/segmentation.npz --class chair --out without_chair.ply
-```
-
-Writes a valid 3DGS PLY, or another [format](formats.md) by the suffix of `--out` or by `--format`; in Python it is
-`gsseg_core.objects.removal.without_objects`. The objects' PLYs and what is left make up the scene, Gaussian for
-Gaussian. What an object hid, no camera has seen: holes are left as they are.
-Gaussians that refinement took out of an object stay in the scene.
 """
 
 if __name__ == "__main__":

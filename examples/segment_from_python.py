@@ -11,6 +11,7 @@ import argparse
 import sys
 
 from gsseg_core import Dataset, EMLearner, GaussianScene, GssegError, Segmentation, export_classes
+from gsseg_core.learn.calibrate import calibrate
 
 parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
 parser.add_argument("scene", metavar="SCENE.ply", help="trained 3DGS scene")
@@ -27,6 +28,7 @@ try:
     learner.fit()
     result = Segmentation.from_codes(scene, learner.codes_, data.class_names, evidence=learner.evidence())
     result = result.carved(scene, [view.camera for view in data.views("train")])  # cut to the silhouettes
+    result = result.calibrated(calibrate(learner).temperature)  # of those 80 % sure, 80 % are right
     files = export_classes(scene, result, options.out)
 except GssegError as error:
     sys.exit(f"segment_from_python: {error}")

@@ -12,6 +12,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from doc_blocks import blocks_of
 from patience import PATIENCE
 from scipy.spatial.transform import Rotation
 from small_scenes import NAMES, write_dataset
@@ -22,6 +23,7 @@ from gsseg_core.data.label_images import read_mask
 from gsseg_core.data.view import View
 from gsseg_core.demo import table_scene
 from gsseg_core.scene.gaussian_scene import GaussianScene
+from gsseg_core.segmentation import Segmentation
 
 REPOSITORY = Path(__file__).parents[2]
 NOTEBOOK = REPOSITORY / "examples/from_ply_to_objects.ipynb"
@@ -39,6 +41,23 @@ def test_every_example_is_listed() -> None:
     listing = (REPOSITORY / "examples/README.md").read_text()
     for path in (REPOSITORY / "examples").iterdir():
         assert path.suffix not in (".py", ".ipynb") or f"({path.name})" in listing, path.name
+
+
+def test_the_program_of_the_readme_gives_what_the_command_gives(
+    tmp_path: Path, demo_run: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "DATASET").symlink_to(demo_run / "scene")
+    (tmp_path / "scene.ply").symlink_to(demo_run / "scene/scene.ply")
+    monkeypatch.chdir(tmp_path)
+    (program,) = (block.code for block in blocks_of("README.md") if block.language == "python")
+    names: dict[str, object] = {}
+    exec(program, names)
+    result, scene = names["result"], names["scene"]
+    assert isinstance(result, Segmentation) and isinstance(scene, GaussianScene)
+    command = Segmentation.load(demo_run / "segmented/segmentation.npz", scene)
+    np.testing.assert_array_equal(result.labels, command.labels)
+    np.testing.assert_array_equal(result.probabilities, command.probabilities)
+    np.testing.assert_array_equal(result.confidence, command.confidence)
 
 
 def copy_with_fewer_views(demo_run: Path, folder: Path, every: int) -> list[str]:
