@@ -63,7 +63,7 @@ def test_the_learner_that_contributing_adds_learns_from_views() -> None:
 
 @pytest.mark.parametrize("name", ["em", "gradient"])
 def test_no_steps_at_all_are_refused_and_not_taken_for_as_many_as_usual(name: str) -> None:
-    with pytest.raises(SettingsError, match=r"is 0.* expected at least"):
+    with pytest.raises(SettingsError, match=r"is 0.* expected (at least one|a whole number, 1)"):
         make_learner(name, SCENE, NUM_CLASSES, max_steps=0)
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import sys
-from types import ModuleType
+from types import ModuleType, SimpleNamespace
 
 import pytest
 from operator_cases import random_view
@@ -38,12 +38,14 @@ def test_the_command_line_refuses_it_before_any_work(command: list[str], capsys:
 def test_a_rasteriser_is_added_by_one_line(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
     scene, camera = random_view(0)
     toy = ModuleType("toy_rasteriser")
-    toy.view_operator = lambda scene, camera, device: (device, len(scene), camera.name)  # type: ignore[attr-defined]
+    toy.view_operator = lambda scene, camera, device: SimpleNamespace(seen=(device, len(scene), camera.name))  # type: ignore[attr-defined]
     monkeypatch.setitem(sys.modules, toy.__name__, toy)
     monkeypatch.setattr(
         "gsseg_core.raster.backends.RASTERISERS", [*RASTERISERS, Rasteriser("toy", "toy", toy.__name__, "")]
     )
-    assert make_operator(scene, camera, "toy") == ("toy", len(scene), camera.name)
+    operator = make_operator(scene, camera, "toy")
+    assert operator.seen == ("toy", len(scene), camera.name)  # type: ignore[attr-defined]
+    assert operator.scene is scene
     assert devices().endswith(", toy")
     with pytest.raises(SettingsError, match=r"or cuda:1 and so on, toy$"):
         make_operator(scene, camera, "abacus")

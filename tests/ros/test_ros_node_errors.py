@@ -188,7 +188,7 @@ MORE_CASES = [
     Case("save_state", "PATH_TAKEN", "main", "taken.npz: is there and is no saved state", {"path": "taken.npz"}),
     Case("export", "PATH_TAKEN", "main", "data: holds 'cameras.json', and no results", {"directory": "data"}),
     Case("learn", "PATH_NOT_ALLOWED", "main", "labels/view1.png: leads out of", {"dataset_path": "leaking"}),
-    Case("learn", "NO_VIEWS", "main", "4 no mask", {"dataset_path": "unlabelled"}),
+    Case("learn", "NO_VIEWS", "main", "no mask: 4 views", {"dataset_path": "unlabelled"}),
     Case("learn", "INVALID_FILE", "main", "cameras.json", {"dataset_path": "taken"}),
     Case("load_scene", "INVALID_FILE", "main", "taken: ", {"path": "taken"}),
     *(
