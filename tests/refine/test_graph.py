@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 import small_scenes
-from hypothesis import given
+from hypothesis import example, given
 from hypothesis import strategies as st
 
 from gsseg_core.data.view import View
@@ -120,6 +120,7 @@ def test_what_no_code_reaches_stays_unknown() -> None:
 
 
 @given(st.integers(0, 99), st.integers(1, 40), st.integers(1, 4))
+@example(37, 36, 3)
 def test_codes_without_evidence_are_probabilities_and_stay_where_nothing_is_known_around(
     seed: int, count: int, k: int
 ) -> None:
@@ -131,7 +132,7 @@ def test_codes_without_evidence_are_probabilities_and_stay_where_nothing_is_know
     np.testing.assert_allclose(spread.sum(axis=1)[known], 1, atol=1e-5)
     alone = np.zeros_like(codes)
     alone[0] = 1 / 3
-    np.testing.assert_array_equal(propagate(graph, alone, evidence)[0], alone[0])
+    np.testing.assert_allclose(propagate(graph, alone, evidence)[0], alone[0], rtol=1e-6)  # one rounding of float32
 
 
 def test_without_strength_nothing_changes() -> None:
