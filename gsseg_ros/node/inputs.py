@@ -236,11 +236,11 @@ class Inputs:
         self.last_refusal = (time.monotonic(), why)
         self._complaints.add(REFUSED_POSE, why)
 
-    def _set_back(self, stamp: int) -> None:
+    def _set_back(self, before: int, began: int) -> None:
         for camera in self.cameras.values():
-            camera.set_back(stamp)
+            camera.set_back(began)
         if self.tf is not None:  # It may hold what the pairings, without a mask, have not asked for.
-            self.tf.clear()
+            self.tf.set_back(before, began)
         if forgotten := sum(detections.clear() for detections in self.detections):
             self._count_rejected("time_jump", forgotten)
         self._hand_over()

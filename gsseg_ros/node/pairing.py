@@ -235,7 +235,8 @@ class Pairing:
         if self._timeline.epoch > epoch:
             for waiting in sorted(self._waiting):
                 self._pair(waiting, last_chance=True, epoch=epoch)
-            for kept in (self._poses, self._camera_infos, self._seen, self._depths):
+            self._poses.set_back(*self._timeline.last_jump)
+            for kept in (self._camera_infos, self._seen, self._depths):
                 kept.clear()
             self._unclear_until = 0
         if self._timeline.lost_masks:

@@ -15,6 +15,9 @@ class Transforms(Protocol):
     def look_up(self, frame_id: str, stamp: int, within: str = "") -> Pose | None:
         """Look up the pose (4, 4) of a frame in another, the map if none is named; None if not known (yet)."""
 
+    def set_back(self, before: int, began: int) -> None:
+        """Forget what is from before time was set back from `before` to `began` (ns)."""
+
 
 class PoseFrames:
     """Composes a pose with what lies between its frame and the map, and between its child frame and the camera.
@@ -49,6 +52,11 @@ class PoseFrames:
         to_map = self._known(given.frame_id, "", stamp) if given.frame_id not in ("", self._map_frame) else np.eye(4)
         camera = self._camera_in(given.child_frame_id, frame_id, stamp)
         return None if to_map is None or camera is None else to_map @ given.matrix @ camera
+
+    def set_back(self, before: int, began: int) -> None:
+        """Forget the transforms from before time was set back from `before` to `began` (ns)."""
+        if self._transforms is not None:
+            self._transforms.set_back(before, began)
 
     def _camera_in(self, child: str, frame_id: str, stamp: int) -> Pose | None:
         if child and child == frame_id:  # The pose is the camera's own.

@@ -36,6 +36,9 @@ class Frames(Protocol):
     def camera_in_map(self, given: GivenPose, stamp: int, frame_id: str) -> Pose | None:
         """Pose (4, 4) in the map of the camera `frame_id`, of a pose at `stamp`; None if it is not known (yet)."""
 
+    def set_back(self, before: int, began: int) -> None:
+        """Forget what is from before time was set back from `before` to `began` (ns)."""
+
 
 class PoseSource(Protocol):
     """Source of the poses of cameras in the map."""
@@ -54,8 +57,8 @@ class PoseSource(Protocol):
     def too_late(self, stamp: int) -> bool:
         """Whether no pose for `stamp` can come any more."""
 
-    def clear(self) -> None:
-        """Forget everything: time was set back."""
+    def set_back(self, before: int, began: int) -> None:
+        """Forget what is from before time was set back from `before` to `began` (ns)."""
 
 
 class MessagePoses:
@@ -95,9 +98,11 @@ class MessagePoses:
         went_on = bool(self._poses.stamps) and self._poses.stamps[-1] >= stamp + BEHIND_NS + self._tolerance_ns
         return went_on and self._given(stamp, True) is None
 
-    def clear(self) -> None:
-        """Forget all poses."""
+    def set_back(self, before: int, began: int) -> None:
+        """Forget all poses, and what the frames know from before time was set back."""
         self._poses.clear()
+        if self._frames is not None:
+            self._frames.set_back(before, began)
 
     def _given(self, stamp: int, last_chance: bool) -> GivenPose | None:
         """Find the pose of a stamp, as messages gave it; None if it is not there (yet)."""
@@ -178,7 +183,7 @@ class TfFirst(MessagePoses):
         """Tell nothing, as TF may still come to know it."""
         return False
 
-    def clear(self) -> None:
-        """Forget all poses, and all transforms but the static ones."""
-        super().clear()
-        self._tf.clear()
+    def set_back(self, before: int, began: int) -> None:
+        """Forget all poses, and the transforms from before time was set back."""
+        super().set_back(before, began)
+        self._tf.set_back(before, began)

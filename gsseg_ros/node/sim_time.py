@@ -8,7 +8,7 @@ from typing import Any
 
 from builtin_interfaces.msg import Time
 from rclpy.callback_groups import CallbackGroup
-from rclpy.clock import Clock, ClockType, JumpHandle, JumpThreshold
+from rclpy.clock import Clock, ClockType, JumpHandle, JumpThreshold, TimeJump
 from rclpy.duration import Duration
 
 from gsseg_core.text import counted
@@ -67,10 +67,15 @@ def steady_timer(node: Any, period_s: float, callback: Callable[[], None], group
     return node.create_timer(period_s, callback, callback_group=group, clock=steady)
 
 
-def on_set_back(node: Any, heard: Callable[[int], None]) -> JumpHandle:
-    """Have `heard` called with the new time (ns) whenever the clock is set back by a second or more.
+def on_set_back(node: Any, heard: Callable[[int, int], None]) -> JumpHandle:
+    """Have `heard` called with the times before and after (ns) whenever the clock is set back by a second or more.
 
     Returns what is to be kept, and unregistered at the end.
     """
     clock: Clock = node.get_clock()
-    return clock.create_jump_callback(_BACK, post_callback=lambda _: heard(clock.now().nanoseconds))
+
+    def jumped(jump: TimeJump) -> None:
+        now = clock.now().nanoseconds
+        heard(now - jump.delta.nanoseconds, now)
+
+    return clock.create_jump_callback(_BACK, post_callback=jumped)

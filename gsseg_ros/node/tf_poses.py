@@ -3,13 +3,18 @@
 from __future__ import annotations
 
 import threading
+from collections import defaultdict, deque
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
 from gsseg_core.errors import GssegError, SettingsError
-from gsseg_ros.conversions import matrix_from_transform
+from gsseg_ros.conversions import matrix_from_transform, stamp_ns
+from gsseg_ros.node.timeline import BEHIND_NS
+
+_BEHIND_KEPT = 2000  # Transforms of a frame; at 200 Hz, those of ten seconds.
+_UNDER_WAY = 100  # Transforms from before time was set back that may come after it: as deep as tf2_ros subscribes.
 
 
 class TfPoses:
@@ -51,8 +56,9 @@ class TfPoses:
         self.problem = ""
         self._map_frame = map_frame
         self._buffer = Buffer()
+        self._heard = _Heard(self._buffer)
         self._listening, self._listener = threading.Lock(), None
-        self._listen = lambda: TransformListener(self._buffer, node)
+        self._listen = lambda: TransformListener(self._heard, node)
         self._time, self._not_found = Time, TransformException
 
     @classmethod
@@ -98,11 +104,69 @@ class TfPoses:
         """Tell nothing: any transform of a chain may still come, so that a mask waits for its time to be over."""
         return False
 
-    def clear(self) -> None:
-        """Forget all transforms but the static ones."""
-        self._buffer.clear()
+    def set_back(self, before: int, began: int) -> None:
+        """Forget the transforms from before time was set back from `before` to `began` (ns), but not the static ones.
+
+        Those of the time since, which may have come before that was known, stay.
+        """
+        self._heard.set_back(before, began)
 
     def close(self) -> None:
         """Stop listening."""
         if self._listener is not None:
             self._listener.unregister()
+
+
+class _Heard:
+    """Hands transforms on to a buffer of tf2, and lets it follow when time is set back.
+
+    TF notices nothing of that by itself: a buffer refuses what is ten seconds older than the newest, and `clear` takes
+    what has come of the new time along. So transforms that are no newer than the newest of their child frame are kept
+    until a newer one shows that they were late.
+    """
+
+    def __init__(self, buffer: Any) -> None:
+        self._buffer, self._lock = buffer, threading.Lock()  # The listener calls from several threads.
+        # By child frame: the newest stamp (ns), and what has come since that is no newer.
+        self._newest: dict[str, int] = {}
+        self._behind: dict[str, deque[Any]] = defaultdict(lambda: deque(maxlen=_BEHIND_KEPT))
+        self._began = self._under_way = 0
+
+    def set_transform(self, transform: Any, authority: str) -> None:
+        """Take in a transform."""
+        with self._lock:
+            child, stamp = transform.child_frame_id, stamp_ns(transform.header.stamp)
+            if self._is_straggler(child, stamp):
+                return
+            if stamp > self._newest.get(child, -1):
+                self._newest[child] = stamp
+                self._behind.pop(child, None)
+            else:
+                self._behind[child].append(transform)
+            self._buffer.set_transform(transform, authority)
+
+    def set_transform_static(self, transform: Any, authority: str) -> None:
+        """Take in a static transform."""
+        self._buffer.set_transform_static(transform, authority)
+
+    def set_back(self, before: int, began: int) -> None:
+        """Forget what is from before time was set back; nothing, where another camera has shown that already."""
+        middle = (before + began) // 2
+        with self._lock:
+            if all(newest < middle for newest in self._newest.values()):
+                return
+            kept = [t for behind in self._behind.values() for t in behind if stamp_ns(t.header.stamp) < middle]
+            self._buffer.clear()
+            self._newest.clear()
+            self._behind.clear()
+            self._began, self._under_way = began, _UNDER_WAY
+        for transform in kept:
+            self.set_transform(transform, "")
+
+    def _is_straggler(self, child: str, stamp: int) -> bool:
+        """Whether a transform is from before time was set back: far ahead of all since, its frame not heard since."""
+        if not self._under_way or child in self._newest:
+            return False
+        ahead = stamp >= max([self._began, *self._newest.values()]) + BEHIND_NS
+        self._under_way -= ahead
+        return ahead
