@@ -158,6 +158,8 @@ class CameraStreams:
             matrix = matrix_from_pose(pose, topic)
         except PoseError as error:
             self._refuse_pose(str(error))
+            for pairing in self._pairings:
+                pairing.refuse_pose(stamp_ns(header.stamp))
             return
         for pairing in self._pairings:
             pairing.add_pose(stamp_ns(header.stamp), GivenPose(matrix, header.frame_id, child))

@@ -234,6 +234,7 @@ class Inputs:
     def _refuse_pose(self, why: str) -> None:
         self.refused_poses += 1
         self.last_refusal = (time.monotonic(), why)
+        self.explained["bad_pose"] = why
         self._complaints.add(REFUSED_POSE, why)
 
     def _set_back(self, before: int, began: int) -> None:

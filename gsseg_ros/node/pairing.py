@@ -92,9 +92,9 @@ class Pairing:
     Attributes
     ----------
     dropped : Counter
-        Masks not paired, by reason: "no_pose", "no_camera_info", "no_depth", "repeated_stamp" (and the same frame_id),
-        "several_cameras" (whose poses cannot be told apart), "negative_stamp", and "time_jump" for one from before time
-        was set back that came after it.
+        Masks not paired, by reason: "no_pose", "bad_pose" (it came and was refused), "no_camera_info", "no_depth",
+        "repeated_stamp" (and the same frame_id), "several_cameras" (whose poses cannot be told apart),
+        "negative_stamp", and "time_jump" for one from before time was set back that came after it.
     out_of_order : int
         Masks that were older than one before them; they are paired all the same.
     time_jumps : int
@@ -140,6 +140,14 @@ class Pairing:
         if not isinstance(self._poses, MessagePoses):
             raise TypeError(f"{type(self._poses).__name__} takes no poses")
         self._take_in(Message("pose", stamp, given))
+
+    def refuse_pose(self, stamp: int) -> None:
+        """Take in that the pose of a stamp came and cannot be used: a mask that needs just this one goes at once."""
+        with self._lock:
+            if isinstance(self._poses, MessagePoses):
+                self._poses.refuse(stamp)
+                for key in [key for key in self._waiting if key[0] == stamp]:
+                    self._pair(key)
 
     def add_depth(self, stamp: int, message: Any, frame_id: str = "") -> None:
         """Take in a depth image whose header has this stamp and frame: the name of its topic and the message."""
@@ -301,7 +309,7 @@ class Pairing:
         elif waiting.pose is None:
             if not (last_chance or self._poses.too_late(stamp)):
                 return
-            self.dropped["no_pose"] += 1
+            self.dropped["bad_pose" if self._poses.refused(stamp) else "no_pose"] += 1
         elif info is None:
             if not (last_chance or self._info_too_late(stamp, frame_id)):
                 return

@@ -57,6 +57,9 @@ class PoseSource(Protocol):
     def too_late(self, stamp: int) -> bool:
         """Whether no pose for `stamp` can come any more."""
 
+    def refused(self, stamp: int) -> bool:
+        """Whether the pose of `stamp` came, and cannot be used."""
+
     def set_back(self, before: int, began: int) -> None:
         """Forget what is from before time was set back from `before` to `began` (ns)."""
 
@@ -75,7 +78,9 @@ class MessagePoses:
 
     def __init__(self, tolerance_s: float = 0.0, frames: Frames | None = None) -> None:
         self._poses: History[int, GivenPose] = History(_POSES_KEPT)
+        self._refused: History[int, None] = History(_POSES_KEPT)
         self._tolerance_ns, self._frames = round(tolerance_s * SECOND), frames
+        self._bridges = self._tolerance_ns > 0  # Whether others may serve where one is missing.
 
     @property
     def knows_frames(self) -> bool:
@@ -86,6 +91,14 @@ class MessagePoses:
         """Keep the pose of a stamp; of two with the same stamp the first stays."""
         self._poses.add(stamp, given)
 
+    def refuse(self, stamp: int) -> None:
+        """Note that the pose of a stamp cannot be used."""
+        self._refused.add(stamp, None)
+
+    def refused(self, stamp: int) -> bool:
+        """Whether the pose of `stamp` came, and cannot be used."""
+        return stamp in self._refused.values
+
     def at(self, stamp: int, frame_id: str = "", last_chance: bool = False, several: bool = False) -> Pose | None:
         """Find the pose (4, 4) as `PoseSource` says."""
         given = self._given(stamp, last_chance)
@@ -94,13 +107,15 @@ class MessagePoses:
         return given.matrix if self._frames is None else self._frames.camera_in_map(given, stamp, frame_id)
 
     def too_late(self, stamp: int) -> bool:
-        """Whether the poses have gone on from `stamp` by more than they come out of order."""
+        """Whether the poses have gone on from `stamp` by more than they come out of order, or its own was refused."""
         went_on = bool(self._poses.stamps) and self._poses.stamps[-1] >= stamp + BEHIND_NS + self._tolerance_ns
-        return went_on and self._given(stamp, True) is None
+        over = went_on or (self.refused(stamp) and not self._bridges)
+        return over and self._given(stamp, True) is None
 
     def set_back(self, before: int, began: int) -> None:
         """Forget all poses, and what the frames know from before time was set back."""
         self._poses.clear()
+        self._refused.clear()
         if self._frames is not None:
             self._frames.set_back(before, began)
 
@@ -138,7 +153,7 @@ class InterpolatedPoses(MessagePoses):
 
     def __init__(self, max_gap_s: float = 0.2, frames: Frames | None = None, tells_apart: bool = False) -> None:
         super().__init__(0.0, frames)
-        self._max_gap_ns, self._tells_apart = round(max_gap_s * SECOND), tells_apart
+        self._max_gap_ns, self._tells_apart, self._bridges = round(max_gap_s * SECOND), tells_apart, True
 
     @property
     def knows_frames(self) -> bool:

@@ -104,6 +104,10 @@ class TfPoses:
         """Tell nothing: any transform of a chain may still come, so that a mask waits for its time to be over."""
         return False
 
+    def refused(self, stamp: int) -> bool:
+        """Tell nothing: TF does not hand on what it refuses."""
+        return False
+
     def set_back(self, before: int, began: int) -> None:
         """Forget the transforms from before time was set back from `before` to `began` (ns), but not the static ones.
 

@@ -275,6 +275,8 @@ def test_refused_poses_explain_masks_without_a_pose(steady: Steady, hears: Hears
     assert hears.verdict() == (DiagnosticStatus.WARN, "/pose: position is (nan, 0, 0)")
     hears.inputs.dropped["no_pose"] = 1
     assert "neither in time nor late (/pose: position is (nan, 0, 0)); expected" in hears.verdict()[1]
+    hears.inputs.dropped["bad_pose"], hears.inputs.explained["bad_pose"] = 3, "/pose: position is (nan, 0, 0)"
+    assert hears.verdict()[1].endswith("were refused, 3 of them as bad_pose: /pose: position is (nan, 0, 0)")
 
 
 def test_time_that_was_set_back_is_logged_once(steady: Steady, hears: Hears) -> None:

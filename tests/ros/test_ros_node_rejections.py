@@ -92,10 +92,10 @@ BAD = [
         lambda sent: set_stamp(sent, -STEP)),
 ]  # fmt: skip
 BAD_POSES = [
-    Bad("nan", "no_pose", "pose: position is (nan,", lambda sent: setattr(sent["pose"].pose.position, "x", np.nan)),
-    Bad("zeros", "no_pose", "pose: orientation is all zeros: was it filled in?",
+    Bad("nan", "bad_pose", "pose: position is (nan,", lambda sent: setattr(sent["pose"].pose.position, "x", np.nan)),
+    Bad("zeros", "bad_pose", "pose: orientation is all zeros: was it filled in?",
         lambda sent: set_orientation(sent, 0.0, 0.0)),
-    Bad("frame", "no_pose", "pose: frame_id is 'odom'; expected 'map', the parameter map_frame",
+    Bad("frame", "bad_pose", "pose: frame_id is 'odom'; expected 'map', the parameter map_frame",
         set_fields("pose", header=Header(frame_id="odom"))),
 ]  # fmt: skip
 
@@ -195,9 +195,12 @@ def misplaced(shared: Ros, parameters: dict[str, Any]) -> dict[str, Robot]:
 
 
 @pytest.mark.parametrize("bad", BAD_POSES, ids=str)
-def test_a_bad_pose_is_no_pose_and_the_log_says_what_is_wrong_with_it(misplaced: dict[str, Robot], bad: Bad) -> None:
+def test_a_bad_pose_is_the_reason_of_its_mask_and_the_log_says_what_is_wrong_with_it(
+    misplaced: dict[str, Robot], bad: Bad
+) -> None:
     robot = misplaced[bad.what]
-    status = robot.wait_for_status(lambda status: status.get("rejected no_pose") == "2", "two masks without a pose")
+    status = robot.wait_for_status(lambda status: status.get("rejected bad_pose") == "2", "two masks of bad poses")
+    assert "rejected no_pose" not in status
     assert (status["views fused"], status[f"/{bad.what}/pose received"]) == ("0", "2")
     assert robot.process is not None
     robot.process.wait_for(bad.log)

@@ -12,7 +12,7 @@ from pairing_events import MS, S, at_all, expire, send, wait
 
 from gsseg_ros.node.jobs import Worker
 from gsseg_ros.node.pairing import Pairing, PairingSettings
-from gsseg_ros.node.pose_sources import MessagePoses
+from gsseg_ros.node.pose_sources import InterpolatedPoses, MessagePoses
 
 
 @given(st.permutations(["mask", "info", "pose"]), st.floats(0, 4.4), st.floats(0, 4.4))
@@ -83,6 +83,25 @@ def test_a_lost_depth_image_costs_its_mask_alone_and_soon() -> None:
             pairing.add_depth(stamp, image)
     assert [p.stamp for p in pairing.take()] == [6 * S - 1, 6 * S]
     assert pairing.dropped == {"no_depth": 1}
+
+
+@pytest.mark.parametrize("mask_first", [True, False])
+def test_a_mask_whose_pose_is_refused_goes_at_once_and_is_said_to(mask_first: bool) -> None:
+    pairing = Pairing(MessagePoses())
+    send(pairing, [("info", 1 * S), *[("mask", 1 * S)] * mask_first])
+    pairing.refuse_pose(1 * S)
+    send(pairing, [*[("mask", 1 * S)] * (not mask_first), ("mask", 2 * S)])
+    assert (pairing.waiting, pairing.dropped) == (1, {"bad_pose": 1})
+
+
+@pytest.mark.parametrize("poses", [MessagePoses(tolerance_s=0.2), InterpolatedPoses()])
+def test_where_poses_are_interpolated_those_around_a_refused_one_serve(poses: MessagePoses) -> None:
+    pairing = Pairing(poses)
+    send(pairing, [("info", 1 * S), ("pose", 1 * S - 100 * MS), ("mask", 1 * S)])
+    pairing.refuse_pose(1 * S)
+    assert pairing.waiting == 1
+    send(pairing, [("pose", 1 * S + 100 * MS)])
+    assert [p.stamp for p in pairing.take()] == [1 * S]
 
 
 def test_what_is_silent_is_waited_for_ten_seconds() -> None:
