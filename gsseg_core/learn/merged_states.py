@@ -35,8 +35,9 @@ def merge_states(saved: Sequence[Saved]) -> State:  # at least one
     StateMismatchError
         They are of different scenes.
     StateFileError
-        They have different names for one class, or ids that each session gave to the objects that it found; or two are
-        the same, whose votes would count twice; or some have votes of whole rays, and some have not.
+        They have different names for one class, or ids that each session gave to the objects that it found; or one
+        brings no view that one before it has not, and would count twice; or some have votes of whole rays, and some
+        have not.
     """
     first = saved[0]
     names: dict[int, str] = {}
@@ -61,10 +62,10 @@ def merge_states(saved: Sequence[Saved]) -> State:  # at least one
         one.state.check_names(names, one.source, "in the states before it")
         names = names_together(names, one.state.class_names)
         for other in saved[:number]:
-            if _is_same_state(one.state, other.state):
+            if _brings_nothing(one.state, other.state):
                 raise StateFileError(
-                    f"{one.source}: holds the votes and views of {other.source}, which would count twice; expected "
-                    "each state once"
+                    f"{one.source}: {other.source} has all its votes and views already, which would count twice; "
+                    "expected each state once"
                 )
         votes[:, : one.state.votes.shape[1]] += one.state.votes
         for view in one.state.views:
@@ -98,19 +99,28 @@ def _is_same_map(one: LivingScene | None, other: LivingScene | None) -> bool:
     )
 
 
-def _is_same_state(one: State, other: State) -> bool:
-    """Whether two states hold the same votes, and some, of the same views with the same poses and masks."""
-    return (
-        (one.num_fused, len(one.views)) == (other.num_fused, len(other.views))
-        and all(_is_same_view(*views) for views in zip(one.views, other.views, strict=True))
-        and np.array_equal(one.votes, other.votes)
-        and bool(one.votes.any())
-    )
+def _brings_nothing(one: State, other: State) -> bool:
+    """Whether another state holds all views of a state, or the same votes where no views are kept."""
+    if not one.views:
+        return one.num_fused == other.num_fused and bool(one.votes.any()) and np.array_equal(one.votes, other.votes)
+    known = {view.name: view for view in other.views}
+    return bool(one.votes.any()) and all(_is_among(view, known) for view in one.views)
+
+
+def _is_among(view: View, known: dict[str, View]) -> bool:
+    """Whether a view is there, under its name or one that merging gave it."""
+    name, count = view.name, 1
+    while name in known:
+        if _is_same_view(view, known[name]):
+            return True
+        count += 1
+        name = f"{view.name}_{count}"
+    return False
 
 
 def _is_same_view(one: View, other: View) -> bool:
     return (
-        (one.name, one.group) == (other.name, other.group)
+        one.group == other.group
         and np.array_equal(one.camera.K, other.camera.K)
         and np.array_equal(one.camera.world_to_camera, other.camera.world_to_camera)
         and np.array_equal(one.read_labels(), other.read_labels())

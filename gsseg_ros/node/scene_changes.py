@@ -104,7 +104,7 @@ class SceneChanges:
             self._require_current(session)
             response.num_merged = session.merge(paths, workspace.root)
             self._show()
-        response.num_views, response.class_names = session.num_fused, list(session.class_names.values())
+            response.num_views, response.class_names = session.num_fused, list(session.class_names.values())
 
     def _update(self, session: LivingSession, delta: SceneDelta) -> Changed:
         if stamps := {view for move in delta.moves for view in move.views if _STAMP.fullmatch(view)}:

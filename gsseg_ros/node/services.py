@@ -257,7 +257,7 @@ class Services:
             self.clear(run)
             if request.keep_votes:
                 self.show()
-        corners = workspace.settings.scene_to_map.points_to_map(scene.means)
+            corners = workspace.settings.scene_to_map.points_to_map(scene.means)
         response.path, response.scene_hash, response.num_gaussians = str(scene.path), scene.digest, len(scene)
         response.box_min, response.box_max = (point_message(side(axis=0)) for side in (corners.min, corners.max))
         response.seconds = time.perf_counter() - started
@@ -279,7 +279,7 @@ class Services:
         with self.workspace.slot.take("load_state"), self.workspace.run("load_state") as run:
             response.num_views = self.workspace.load_state(path, self.workspace.root)
             self.clear(run)
-        response.path, response.class_names = str(path), list(session.class_names.values())
+            response.path, response.class_names = str(path), list(session.class_names.values())
 
     @answered
     @in_turn

@@ -91,11 +91,27 @@ def test_a_state_that_is_given_twice_or_is_known_already_is_refused_and_a_later_
     again = robot(tmp_path / "again.npz", VIEWS[:2])
     for same in (one, again):
         assert main(["merge", one, later, same, "-o", str(out)]) == 2
-        assert f"{same}: holds the votes and views of {one}, which would count twice" in capsys.readouterr().err
+        assert f"{same}: {one} has all its votes and views already, which" in capsys.readouterr().err
     session = load(one)
-    with pytest.raises(StateFileError, match=r"again\.npz: holds the votes and views of what is known here"):
+    with pytest.raises(StateFileError, match=r"again\.npz: what is known here has all its votes and views already"):
         session.merge([later, again])
     assert session.num_fused == 2 and not out.exists()
+
+
+@pytest.mark.parametrize("others", [VIEWS[3:], [View.from_arrays(VIEWS[5].camera, VIEWS[0].read_labels())]])
+def test_a_state_that_was_merged_already_is_refused_when_it_is_merged_again(tmp_path: Path, others: list[View]) -> None:
+    """As a client does that did not wait for the answer; names of views may have been taken."""
+    named = [
+        View.from_arrays(replace(view.camera, name=f"view{i}"), view.read_labels()) for i, view in enumerate(others)
+    ]
+    state = robot(tmp_path / "b.npz", named)
+    session = load(robot(tmp_path / "a.npz", VIEWS[:3]))
+    assert session.merge([state]) == len(others)
+    session.fuse(VIEWS[4])
+    before = session._live._votes.copy()
+    with pytest.raises(StateFileError, match=r"b\.npz: what is known here has all its votes and views already"):
+        session.merge([state])
+    np.testing.assert_array_equal(session._live._votes, before)
 
 
 def test_objects_that_robots_have_numbered_themselves_are_not_added_up(

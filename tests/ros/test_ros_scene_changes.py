@@ -5,6 +5,7 @@ from __future__ import annotations
 import itertools
 import threading
 from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
@@ -37,6 +38,7 @@ from gsseg_ros.conversions import stamp_message
 from gsseg_ros.delta_messages import delta_from_message, message_from_delta
 from gsseg_ros.errors import InvalidRequestError
 from gsseg_ros.node import diagnostics, inputs
+from gsseg_ros.node.jobs import Job
 from gsseg_ros.node.scene_changes import _with_names
 from gsseg_ros.replay.growing import GrowingSource
 
@@ -195,6 +197,25 @@ def test_an_answer_is_of_its_own_change_whatever_another_client_changes_at_once(
     assert answer.scene_hash == SCENE.subset(np.arange(1, len(SCENE))).digest != session.scene.digest
 
 
+def test_answers_of_loading_and_merging_are_of_their_own_work_whatever_another_client_asks_next(
+    here: NodeHere, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    workspace = here.node.workspace
+    here.done("save_state", path="mine.npz")
+    take, classes = workspace.slot.take, list(workspace.session.class_names.values())
+    workspace.reset()
+
+    @contextmanager
+    def then_another(name: str) -> Iterator[Job]:
+        with take(name) as job:
+            yield job
+        workspace.reset()
+
+    monkeypatch.setattr(workspace.slot, "take", then_another)
+    loaded, merged = here.done("load_state", path="mine.npz"), here.done("merge_states", paths=["mine.npz"])
+    assert loaded.class_names == merged.class_names == classes and merged.num_views == 4
+
+
 def test_a_stamp_names_the_newest_views_that_carry_it_and_no_round_of_time() -> None:
     names = [
         "0a_0_0",
@@ -261,14 +282,17 @@ def test_a_delta_of_the_topic_that_is_being_made_is_waited_for_before_the_node_i
 
 def test_states_of_other_robots_are_added_exactly(here: NodeHere) -> None:
     session = here.node.workspace.living_session
-    here.done("save_state", path="one.npz")
-    alone = votes(session).copy()
-    assert here.ask("merge_states", paths=["one.npz"]).error_code == 11112  # It is here already.
+    other, alone = LivingSession(SCENE), votes(session).copy()
+    for view in clean_views(4):
+        other.fuse(view)
+    other.save(root(here) / "one.npz")
+    answer = here.done("merge_states", paths=["one.npz"])
+    assert (answer.num_merged, answer.num_views) == (4, 8)
+    np.testing.assert_array_equal(votes(session), 2 * alone)
     here.fuse(clean_views(1))
     more = votes(session).copy()
-    answer = here.done("merge_states", paths=["one.npz"])
-    assert (answer.num_merged, answer.num_views) == (4, 9)
-    np.testing.assert_array_equal(votes(session), more + alone)
+    assert here.ask("merge_states", paths=["one.npz"]).error_code == 11112  # It is here already.
+    np.testing.assert_array_equal(votes(session), more)
     assert here.ask("merge_states").error_code == 11103
     assert here.ask("merge_states", paths=["scene.ply"]).error_code == 11112
 
