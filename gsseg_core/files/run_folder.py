@@ -86,7 +86,9 @@ class StagedRun:
         self.id = f"{time.strftime('%Y%m%dT%H%M%SZ', time.gmtime())}-{secrets.token_hex(4)}"
         self.out, self._kind, self._staging = out, kind, out / f".gsseg-{self.id}"
         self.folder = self._staging / "new"
-        self._made: list[Path] = []  # folders above the staged one that were not there, the innermost first
+        self._made: list[
+            Path
+        ] = []  # folders above the staged one, and for its files, that were not there, innermost first
         self._lock = -1
 
     def begin(self) -> None:
@@ -129,8 +131,10 @@ class StagedRun:
             with _locked(self.out):
                 _finish(self.out)
                 self.claim(records)
-                for place in records:
-                    (self.out / place).parent.mkdir(parents=True, exist_ok=True)
+                for folder in sorted({self.out / parent for place in records for parent in Path(place).parents}):
+                    if not folder.exists():
+                        folder.mkdir()
+                        self._made.insert(0, folder)
                 before = Manifest.read(self.out / RUN_FILE)
                 runs = {**before.runs, self._kind: RunRecord(self.id, records)}
                 Manifest(runs, self._staging.name, before.files(self._kind)).write(self._staging / COMMIT_FILE)

@@ -7,6 +7,7 @@ A pinned folder is what was looked at.
 from __future__ import annotations
 
 import contextlib
+import functools
 import os
 from collections.abc import Iterator
 from pathlib import Path
@@ -21,8 +22,9 @@ from gsseg_core.files.run_manifest import Manifest
 def pinned_folder(folder: Path, within: Path) -> Iterator[Path]:
     """Give a second name of a folder, under which it stays the same folder whatever becomes of its path.
 
-    The folder is made where it is missing, below `within` or that itself; both are without links. In the errors of
-    gsseg that the body raises, the first name stands in the place of the second.
+    The folder is made where it is missing, below `within` or that itself; both are without links. Where the body raises
+    an error, folders that were made and are empty go again, and in errors of gsseg the first name stands in the place
+    of the second.
 
     Raises
     ------
@@ -41,6 +43,7 @@ def pinned_folder(folder: Path, within: Path) -> Iterator[Path]:
             for part in folder.relative_to(within).parts:
                 with contextlib.suppress(FileExistsError):
                     os.mkdir(part, dir_fd=descriptor)
+                    opened.push(functools.partial(_remove_where_failed, part, descriptor))
                 descriptor = os.open(part, kind, dir_fd=descriptor)
                 opened.callback(os.close, descriptor)
         except OSError as error:
@@ -50,6 +53,12 @@ def pinned_folder(folder: Path, within: Path) -> Iterator[Path]:
             yield pinned
         except GssegError as error:
             raise type(error)(str(error).replace(str(pinned), str(folder))) from error
+
+
+def _remove_where_failed(name: str, parent: int, error: type[BaseException] | None, *_: object) -> None:
+    if error is not None:
+        with contextlib.suppress(OSError):  # Somebody may have put something there.
+            os.rmdir(name, dir_fd=parent)
 
 
 def require_own_folder(out: Path, kind: str) -> None:

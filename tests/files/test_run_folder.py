@@ -184,9 +184,10 @@ def test_a_full_disk_is_one_clear_error_and_the_earlier_run_stays_whole(tmp_path
             if name == "rename":
                 patch.undo()
                 patch.setattr(os, "rename", no_space)
-            with pytest.raises(WriteError, match=f"{full}.*what was there before is unchanged"):
-                write(out, SECOND)
-        assert contents(out) == before and hidden(out) == [RUN_FILE]
+            for folder in (out, tmp_path / "new"):
+                with pytest.raises(WriteError, match=f"{full}.*what was there before is unchanged"):
+                    write(folder, SECOND)
+        assert contents(out) == before and hidden(out) == [RUN_FILE] and os.listdir(tmp_path) == ["out"]
 
 
 def test_a_file_that_was_edited_since_keeps_its_content_under_another_name(tmp_path: Path) -> None:

@@ -38,6 +38,19 @@ def test_errors_name_the_folder_as_it_was_asked_for(tmp_path: Path) -> None:
         pass
 
 
+def test_a_folder_that_was_made_for_what_then_failed_goes_again_with_those_above_it(tmp_path: Path) -> None:
+    root, there = tmp_path / "root", tmp_path / "root" / "there"
+    there.mkdir(parents=True)
+    for folder in (there, there / "deep" / "er"):
+        with pytest.raises(WriteError), staged_export(folder, root) as run:
+            raise WriteError(f"{run.folder}: cannot be written (No space left on device)")
+    assert list(root.rglob("*")) == [there]
+    with pytest.raises(WriteError), pinned_folder(there / "deep" / "er", root) as pinned:
+        (pinned / "mine").write_text("written")
+        raise WriteError("later")
+    assert (there / "deep" / "er" / "mine").read_text() == "written"
+
+
 def test_a_folder_for_exports_only_must_be_new_empty_or_an_export(tmp_path: Path) -> None:
     for _ in range(2):
         require_own_folder(tmp_path / "new", "segment")
