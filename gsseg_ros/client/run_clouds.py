@@ -7,8 +7,8 @@ import threading
 import time
 from collections.abc import Iterator
 
+from gsseg_msgs.msg import SegmentationReport
 from sensor_msgs.msg import PointCloud2
-from std_msgs.msg import Header
 
 from gsseg_ros.client.spinner import Spinner
 from gsseg_ros.conversions import stamp_ns
@@ -49,15 +49,19 @@ class RunClouds:
                 if not self._awaiting:
                     self._clouds.clear()
 
-    def of_run(self, header: Header, deadline: float) -> PointCloud2 | None:
-        """Wait for the cloud of a run, by the header of its report; None if that of a later one has come instead.
+    def of_run(self, report: SegmentationReport, deadline: float) -> PointCloud2 | None:
+        """Wait for the cloud of a run; None if it was not published, or that of a later one has come instead.
+
+        A run that others replaced, or got ahead of, is answered all the same; its report has no stage "publish".
 
         Raises
         ------
         NodeUnavailableError
             Neither has come by the deadline (s, `time.monotonic`).
         """
-        stamp = stamp_ns(header.stamp)
+        stamp = stamp_ns(report.header.stamp)
+        if all(stage.name != "publish" for stage in report.stages) and time.monotonic() < deadline:
+            return None
         if not self._spinner.wait_for(lambda: max([*self._clouds, -1]) >= stamp, deadline - time.monotonic()):
             publishers = self._spinner.node.count_publishers(self._topic.topic_name)
             raise NodeUnavailableError(

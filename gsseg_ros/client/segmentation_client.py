@@ -168,7 +168,7 @@ class SegmentationClient(SceneRequests):
         with self._clouds.kept():
             answer = self._call(Segment, request, timeout)
             cloud = None if publish else answer.cloud
-            while cloud is None and (cloud := self._clouds.of_run(answer.report.header, deadline)) is None:
+            while cloud is None and (cloud := self._clouds.of_run(answer.report, deadline)) is None:
                 answer = self._call(Segment, request, deadline - time.monotonic())
         return segment_result(answer, arrays_from_cloud(cloud))
 

@@ -37,6 +37,7 @@ pytest.importorskip("gsseg_msgs.msg", reason="gsseg_msgs is not installed")
 import rclpy
 from builtin_interfaces.msg import Time
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
+from gsseg_msgs.msg import SegmentationReport, StageTiming
 from gsseg_msgs.srv import Reset
 from sensor_msgs.msg import PointCloud2
 from std_msgs.msg import Header
@@ -68,6 +69,11 @@ def test_a_question_whose_answer_is_lost_is_asked_again_for_as_long_as_the_node_
     assert calls.ask(client, "well?", time.monotonic()) is None
 
 
+def report(second: int, *stages: str) -> SegmentationReport:
+    timings = [StageTiming(name=name) for name in stages or ("boxes", "publish")]
+    return SegmentationReport(header=Header(stamp=Time(sec=second)), stages=timings)
+
+
 def test_of_the_clouds_of_requests_that_overlap_without_end_only_the_last_are_kept() -> None:
     node = SimpleNamespace(create_subscription=lambda kind, topic, take, quality: take)
     spinner: Any = SimpleNamespace(node=node, wait_for=lambda condition, _: condition())
@@ -76,10 +82,11 @@ def test_of_the_clouds_of_requests_that_overlap_without_end_only_the_last_are_ke
     with clouds.kept():  # One of them is always at work.
         for second in range(1, 1001):
             take(PointCloud2(header=Header(stamp=Time(sec=second))))
-            found = clouds.of_run(Header(stamp=Time(sec=second)), time.monotonic())
+            found = clouds.of_run(report(second), time.monotonic())
             assert found is not None and found.header.stamp.sec == second
         assert len(clouds._clouds) < 20
-        assert clouds.of_run(Header(stamp=Time(sec=1)), time.monotonic()) is None, "it is asked for again"
+        assert clouds.of_run(report(1), time.monotonic()) is None, "it is asked for again"
+        assert clouds.of_run(report(2000, "boxes"), time.monotonic() + PATIENCE) is None, "it was not published"
 
 
 def test_cancel_from_another_thread_ends_learning_and_changes_nothing(learnt: Place) -> None:

@@ -216,6 +216,16 @@ def test_answers_of_loading_and_merging_are_of_their_own_work_whatever_another_c
     assert loaded.class_names == merged.class_names == classes and merged.num_views == 4
 
 
+def test_a_run_whose_views_were_replaced_meanwhile_says_that_it_was_not_published(
+    here: NodeHere, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    stages = [stage.name for stage in here.done("segment").report.stages]
+    number = here.node.workspace.number
+    monkeypatch.setattr(here.node.workspace, "number", lambda run: (here.node.workspace.reset(), number(run)))
+    again = here.done("segment").report
+    assert stages[-1] == "publish" not in [stage.name for stage in again.stages]
+
+
 def test_a_stamp_names_the_newest_views_that_carry_it_and_no_round_of_time() -> None:
     names = [
         "0a_0_0",
