@@ -27,6 +27,7 @@ from gsseg_core.segmentation import REMOVED, Segmentation
 pytest.importorskip("gsseg_msgs.msg", reason="gsseg_msgs is not installed")
 
 from action_msgs.msg import GoalStatus
+from action_msgs.srv import CancelGoal
 from gsseg_msgs.action import Learn
 
 LEARNERS = ("em", "votes", "gradient")
@@ -247,6 +248,15 @@ def test_cancel_ends_it_at_once_and_keeps_the_codes_from_before(
     after = robot.done("segment").report
     assert (after.learner, after.num_views) == (report.learner, report.num_views) == ("votes", 8)
     assert robot.learn()[0] == GoalStatus.STATUS_SUCCEEDED, "the next goal is welcome"
+
+
+def test_anybody_cancels_the_goal_of_a_client_that_is_gone(robot: Robot) -> None:
+    goal, node = robot.begin(**endless("em")), robot.ros.node
+    anybody = node.create_client(CancelGoal, f"{robot.name}/learn/_action/cancel_goal")
+    robot.ros.wait_until(anybody.service_is_ready, "the service")
+    assert len(robot.ros.result(anybody.call_async(CancelGoal.Request())).goals_canceling) == 1
+    assert robot.outcome(goal)[0] == GoalStatus.STATUS_CANCELED
+    node.destroy_client(anybody)
 
 
 def test_cancel_keeps_what_an_earlier_goal_learnt(robot: Robot) -> None:
