@@ -19,7 +19,6 @@ from itertools import permutations, product
 from typing import Any
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from gsseg_core.align.agreement import Shown, render, thinned
 from gsseg_core.align.settings import AlignSettings
@@ -99,6 +98,8 @@ class Alignment:
     @property
     def parts(self) -> list[str]:
         """What was found, for people; nothing where cameras are in the scene's frame as they are."""
+        from scipy.spatial.transform import Rotation  # It takes a while to load, and most cameras fit as they are.
+
         found, parts = self.similarity, self.convention.parts
         turn = Rotation.from_matrix(found.rotation).as_rotvec(degrees=True)
         if abs(found.scale - 1) > 1e-9:

@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import os
 from collections.abc import Callable
+from functools import partial
 from typing import Any, TypeVar, overload
 
 import numba
 from numba.core.dispatcher import Dispatcher
 
-from gsseg_core.kernels import kernel_cache as _kernel_cache  # noqa: F401 - before any kernel is defined
+from gsseg_core.kernels import kernel_cache
 
 # Before the first kernel loads OpenMP: threads of kernels that wait for others must not spin. Where other programs use
 # the cores, too, those would wait for them: observing a view takes four to six times as long then.
@@ -19,8 +20,10 @@ F = TypeVar("F", bound=Callable[..., object])
 
 _njit: Any = numba.njit  # Its types know fewer options than it takes.
 _LESS: dict[str, Any] = {}
-# Versions that were not tried compile in numba's own way, which takes longer.
+_keep: Callable[[Dispatcher[Any]], None] = Dispatcher.enable_caching
+# Versions that were not tried compile and load in numba's own way, which takes longer.
 if numba.__version__.startswith("0.68."):
+    from gsseg_core.kernels.loading import keep as _keep
     from gsseg_core.kernels.parts import KernelCompiler
 
     _LESS = {"no_cfunc_wrapper": True, "pipeline_class": KernelCompiler}
@@ -36,7 +39,12 @@ def kernel(**options: Any) -> Callable[[F], Dispatcher[F]]: ...
 
 def kernel(function: Callable[..., object] | None = None, **options: Any) -> Any:
     """Compile a function that Python calls, and keep it from one run to the next; other threads run beside it."""
-    return _njit(function, cache=True, nogil=True, **_LESS, **options)
+    if function is None:
+        return partial(kernel, **options)
+    made = _njit(function, nogil=True, **_LESS, **options)
+    if kernel_cache.FOLDER is not None:
+        _keep(made)
+    return made
 
 
 def called_by_kernels(function: Callable[..., Any] | None = None, **options: Any) -> Any:

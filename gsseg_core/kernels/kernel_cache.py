@@ -1,13 +1,11 @@
 """Where compiled kernels are kept from one run to the next, and what is done where they cannot be.
 
 numba looks for a folder when a kernel is defined, that is, when its module is imported, and raises an error if it may
-write to none. So the decorators of kernels import this module, which looks before numba does; where there is no such
-folder, the kernels do without.
+write to none. So this module looks first; where there is no such folder, the kernels do without.
 """
 
 from __future__ import annotations
 
-import contextlib
 import os
 import sys
 import tempfile
@@ -37,22 +35,5 @@ def writable(folder: str) -> bool:
     return True
 
 
-def _do_without() -> None:
-    """Have numba compile the kernels of gsseg as if nobody had asked to keep them."""
-    from numba.core.dispatcher import Dispatcher
-
-    keep = Dispatcher.enable_caching
-
-    def enable_caching(self: Dispatcher) -> None:
-        if not self.py_func.__module__.startswith(_PACKAGE.name):
-            keep(self)
-
-    Dispatcher.enable_caching = enable_caching  # type: ignore[method-assign]
-
-
 FOLDER: str | None = next(filter(writable, candidates()), None)
 """The folder that numba will take; None where it can write to none, so that each run compiles anew."""
-
-if FOLDER is None:
-    with contextlib.suppress(ImportError):  # Without numba there are no kernels; `gsseg doctor` says so.
-        _do_without()

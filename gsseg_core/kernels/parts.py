@@ -60,13 +60,9 @@ class _PartsCodegen(JITCPUCodegen):
         if self._engine.is_symbol_defined(name):  # A part without machine code has no variable for it.
             super().set_env(name, environment)
 
-    def unserialize_library(self, state: object) -> JITCodeLibrary:
-        with _taken_for(JITCPUCodegen, self):  # Machine code of a kernel that calls this one or is called by it.
-            return JITCPUCodegen.unserialize_library(self, state)
-
 
 @contextmanager
-def _taken_for(kind: type[JITCPUCodegen], codegen: JITCPUCodegen) -> Iterator[None]:
+def taken_for(kind: type[JITCPUCodegen], codegen: JITCPUCodegen) -> Iterator[None]:
     """Within the context, of one thread as all compiling is, the code generator is of this kind."""
     before, codegen.__class__ = codegen.__class__, kind
     try:
@@ -108,5 +104,5 @@ class KernelCompiler(CompilerBase):
         codegen = self.state.targetctx.codegen()
         self.state.library = JITCodeLibrary(codegen, function.__qualname__)
         self.state.library.enable_object_caching()
-        with _taken_for(_PartsCodegen, codegen):
+        with taken_for(_PartsCodegen, codegen):
             return super().compile_extra(function)

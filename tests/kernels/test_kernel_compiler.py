@@ -94,6 +94,39 @@ def test_a_kernel_calls_another_that_is_in_the_cache(load: Callable[[], ModuleTy
     assert np.array_equal(again.outer(XS), module.outer(XS)) and again.outer.stats.cache_hits
 
 
+def test_a_kernel_that_is_loaded_reads_nothing_that_only_compiling_needs(load: Callable[[], ModuleType]) -> None:
+    load().outer(XS)
+    module = load()
+    made = module.outer(XS)
+    assert module.outer.stats.cache_hits and np.array_equal(made, np.diff((2.5 * (XS + 1) - 1) ** 2))
+    (loaded,) = module.outer.overloads.values()
+    assert loaded.library._shared_module is None
+
+
+def test_all_kernels_load_without_the_parts_of_numba_that_compile_and_it_compiles_after_them() -> None:
+    program = """
+import sys
+import numpy as np, numba
+from gsseg_core.warm_up import warm_up
+warm_up()
+print([name for name in ("numba.np.arraymath", "numba.typed.typedlist", "scipy.linalg") if name in sys.modules])
+warned = "no such class"
+@numba.njit
+def largest(x):
+    if not len(x):
+        raise ValueError(warned)
+    return np.sort(x)[-1] + np.dot(x, x)
+print(largest(np.array([1.0, 2.0])))
+try:
+    largest(np.empty(0))
+except ValueError as error:
+    print(error)
+"""
+    subprocess.run([sys.executable, "-c", "from gsseg_core.warm_up import warm_up; warm_up()"], check=True)
+    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True)
+    assert done.stdout.splitlines() == ["[]", "7.0", "no such class"]
+
+
 def test_numba_compiles_as_it_did_after_a_kernel_that_fails(with_code: list[str]) -> None:
     from gsseg_core.kernels.compiler import kernel
 
