@@ -40,7 +40,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     except Exception as error:
         if interrupts.was_raised():
             return interrupts.EXIT_CODE
-        if isinstance(error, MemoryError):
+        if isinstance(error, MemoryError) or type(error).__name__ == "OutOfMemoryError":  # PyTorch's, of a GPU
             terminal.note(f"error: memory is not enough ({error}); expected smaller views, or a smaller scene")
             return 2
         if not isinstance(error, GssegError):

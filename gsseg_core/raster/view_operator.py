@@ -187,7 +187,10 @@ class ViewOperator(ViewRenderer):
 
     @abstractmethod
     def objects_alone(self, labels: np.ndarray) -> ObjectsAlone:
-        """Choose the Gaussians that belong to an object, those of labels (N,) int32 above 0, each object by itself."""
+        """Choose the Gaussians that belong to an object, those of labels (N,) int32 above 0, each object by itself.
+
+        Raises `SceneValueError` where the labels are of another number of Gaussians.
+        """
 
     @abstractmethod
     def _weights(self, pixel: tuple[int, int] | None) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

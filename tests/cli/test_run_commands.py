@@ -14,6 +14,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import torch
 from PIL import Image
 from segmented_place import assert_one_line
 from small_scenes import balls_on_a_table, write_dataset
@@ -183,13 +184,14 @@ def test_an_empty_path_is_not_taken_for_the_folder_where_the_command_is_typed(
     assert contents(place) == before
 
 
+@pytest.mark.parametrize("error", [MemoryError, torch.cuda.OutOfMemoryError])
 def test_too_little_memory_is_one_clear_line_and_the_results_of_before_stay(
-    place: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+    place: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch, error: type[Exception]
 ) -> None:
     before = contents(place)
 
     def too_large(*_: object, **__: object) -> None:
-        raise MemoryError("Unable to allocate 1.50 GiB for an array")
+        raise error("Unable to allocate 1.50 GiB for an array")
 
     monkeypatch.setattr("gsseg_core.pipeline.make_learner", too_large)
     assert main(command(place)) == 2

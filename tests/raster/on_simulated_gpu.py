@@ -7,6 +7,8 @@ from __future__ import annotations
 
 import gc
 import weakref
+from collections.abc import Callable
+from typing import Any
 
 import numpy as np
 import pytest
@@ -15,11 +17,13 @@ from operator_cases import dense, make_camera, make_scene, random_mask, random_v
 
 from gsseg_core.csr_rows import CSRRows
 from gsseg_core.data.label_evidence import LabelEvidence
+from gsseg_core.errors import GssegError, SceneValueError
 from gsseg_core.learn.em import em_cpu_kernels, em_gpu_kernels
 from gsseg_core.learn.learner import UNITS
 from gsseg_core.raster.backends import make_operator, vote_total
+from gsseg_core.raster.cpu import tiling
 from gsseg_core.raster.depth import depths
-from gsseg_core.raster.gpu import gpu_operator
+from gsseg_core.raster.gpu import gpu_observation, gpu_operator
 from gsseg_core.raster.gpu.gpu_operator import GPUOperator
 from gsseg_core.raster.gpu.tensors import RowTensors
 from gsseg_core.raster.observation import Observation
@@ -172,6 +176,60 @@ def test_nothing_seen_is_no_pairs() -> None:
     operator = make_operator(behind, make_camera(WIDTH, HEIGHT), "cuda")
     assert not len(operator.observe(MASK).ids)
     assert (operator.transmittance() == 1).all()
+
+
+@pytest.mark.parametrize("kind", ["u2", "u4", "u8", ">i4", "read-only"])
+def test_labels_may_be_integers_of_any_kind(kind: str) -> None:
+    mask = np.where(MASK < 0, 3, MASK)
+    taken = mask.copy() if kind == "read-only" else mask.astype(kind)
+    taken.setflags(write=kind != "read-only")
+    operator = operators()[1]
+    np.testing.assert_array_equal(operator.observe(taken).votes(), operator.observe(mask).votes())
+
+
+def test_codes_and_weights_of_float64_are_taken() -> None:
+    codes, weights = some_codes(), RNG.random((-(-HEIGHT // 4), -(-WIDTH // 4)))
+    rows = CSRRows.from_dense(codes.astype(np.float64))
+    ours, theirs = (operator.blend_rows(rows, CLASSES).image for operator in operators())
+    np.testing.assert_allclose(theirs, ours, atol=NEAR)
+    ours, theirs = (operator.observe(MASK, weights=weights).weighted_areas for operator in operators())
+    np.testing.assert_allclose(theirs, ours, rtol=1e-12)
+
+
+SOME = np.arange(2, dtype=np.int32)  # of the Gaussians
+REFUSED: dict[str, Callable[[ViewOperator, CSRRows], Any]] = {
+    "codes of too many classes": lambda operator, codes: operator.blend_rows(codes, CLASSES - 1),
+    "strongest of too many classes": lambda operator, codes: operator.strongest(codes, CLASSES - 1, True),
+    "codes of some": lambda operator, codes: operator.blend_rows(codes.take(SOME), CLASSES, SOME),
+    "wanted of another size": lambda operator, codes: operator.strongest(codes, CLASSES, True, wanted=MASK[1:] > 0),
+    "pixels of another size": lambda operator, _: operator.blend_seen(np.ones((len(operator.ids), 1)), MASK[1:] > 0),
+    "labels of some": lambda operator, _: operator.objects_alone(SOME),
+    "labels of more": lambda operator, _: operator.objects_alone(np.zeros(len(SCENE) + 1, np.int32)),
+}
+
+
+@pytest.mark.parametrize("what", REFUSED)
+def test_what_the_cpu_refuses_is_refused_in_the_same_words(what: str) -> None:
+    said, codes = [], CSRRows.from_dense(np.ones((len(SCENE), CLASSES), np.float32))
+    for operator in operators():
+        with pytest.raises(GssegError) as error:
+            REFUSED[what](operator, codes)
+        said.append(str(error.value))
+    assert said[0] == said[1]
+
+
+def test_a_view_with_more_entries_than_can_be_numbered_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(tiling, "MOST_ENTRIES", 5)
+    with pytest.raises(SceneValueError, match=f"tiles of a view of {WIDTH} x {HEIGHT} pixels.* expected at most 5$"):
+        make_operator(SCENE, CAMERA, "cuda")
+
+
+def test_sums_may_be_larger_than_64_bits_hold() -> None:
+    # As of 4 megapixels of one of 500 labels that are explained by chance alone, in a thousandth of the pixels.
+    units = torch.tensor([(1 << 58) + 1] * 96)
+    by_label = gpu_observation._px_by_label(units, torch.zeros(96, dtype=torch.int64), 2)
+    np.testing.assert_array_equal(by_label, [96 * 2.0**34, 0])
+    np.testing.assert_array_equal(em_gpu_kernels._in_px(units[:, None, None]), [[96 * 2.0**34]])
 
 
 # Steps of EM

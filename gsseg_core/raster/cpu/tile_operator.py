@@ -49,6 +49,7 @@ class TileOperator(ViewOperator):
 
     def objects_alone(self, labels: np.ndarray) -> ObjectsAlone:
         """Choose the Gaussians that belong to an object."""
+        self._check_rows(len(labels), None, what="labels")
         return TileObjects.of(self.ids, self._tiles, labels)
 
     def _without(self, hidden: np.ndarray) -> TileOperator:

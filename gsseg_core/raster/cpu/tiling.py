@@ -41,10 +41,7 @@ class Tiles(NamedTuple):
 
 
 def assign(projected: Projected, width: int, height: int) -> Tiles:
-    """Sort projected Gaussians into the tiles that their ellipse of alpha >= 1/255 touches.
-
-    Raises `SceneValueError` where that makes more than `MOST_ENTRIES`.
-    """
+    """Sort projected Gaussians into the tiles that their ellipse of alpha >= 1/255 touches; see `check_entries`."""
     columns, rows = -(-width // TILE), -(-height // TILE)
     count = len(projected.ids)
     gaussian_start = np.zeros(count + 1, np.int64)
@@ -52,11 +49,7 @@ def assign(projected: Projected, width: int, height: int) -> Tiles:
     while True:
         touched = np.empty((CHUNKS, capacity), np.int32)
         needed = _list(projected.table, columns, rows, gaussian_start[1:], touched)
-        if (total := int(needed.sum())) > MOST_ENTRIES:
-            raise SceneValueError(
-                f"scene: its Gaussians touch {total} tiles of a view of {width} x {height} pixels, each counted for "
-                f"each of them; expected at most {MOST_ENTRIES}"
-            )
+        check_entries(int(needed.sum()), width, height)
         if needed.max() <= capacity:
             break
         capacity = int(needed.max())
@@ -69,6 +62,15 @@ def assign(projected: Projected, width: int, height: int) -> Tiles:
     entries = np.empty(start[-1], np.int32)
     _fill(touched, gaussian_start, projected.order, place, entries)
     return Tiles(width, height, columns, rows, projected.table, start, entries, gaussian_start, touched)
+
+
+def check_entries(total: int, width: int, height: int) -> None:
+    """Raise `SceneValueError` where a view has more than `MOST_ENTRIES`."""
+    if total > MOST_ENTRIES:
+        raise SceneValueError(
+            f"scene: its Gaussians touch {total} tiles of a view of {width} x {height} pixels, each counted for "
+            f"each of them; expected at most {MOST_ENTRIES}"
+        )
 
 
 @nb.njit(inline="always")

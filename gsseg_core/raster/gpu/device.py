@@ -89,7 +89,7 @@ _as_taken: Callable[[torch.Tensor], Any] = torch.Tensor.numpy if SIMULATED else 
 
 def on_device(array: np.ndarray, device: torch.device) -> torch.Tensor:
     """Copy an array to a device; on return the array may be changed."""
-    here = torch.from_numpy(np.ascontiguousarray(array))
+    here = torch.from_numpy(np.require(array, requirements=["C", "W"]))  # PyTorch warns of what is read-only.
     # Ordinary memory is read at once, and what the device has still to do is not waited for.
     return here.to(device, copy=True, non_blocking=not here.is_pinned())
 

@@ -40,8 +40,8 @@ class GPUObservation(Observation):
         self._shared: tuple[torch.Tensor, np.ndarray, ShareTensors] | None = None  # what was asked last
         if weights is None:
             weights = np.ones((-(-tiles.height // BLOCK), -(-tiles.width // BLOCK)), np.float32)
-        self._weights = on_device(weights, device)
-        mask = self._count_labels(on_device(labels, device))
+        self._weights = on_device(weights.astype(np.float32, copy=False), device)
+        mask = self._count_labels(on_device(labels.astype(np.int32, copy=False), device))
         self._slots, self._label_start, self._present = _cut(mask, tiles)
         self._operator_bytes = tiles.nbytes
         self._pair_up(tiles)
@@ -146,8 +146,7 @@ class GPUObservation(Observation):
     def votes_by_label(self) -> np.ndarray:
         """Sum of the votes of each label, (L,) float64."""
         units = (self.own_votes.double() * kernels.UNITS).long()
-        total = units.new_zeros(len(self.classes)).index_add_(0, self.pairs.labels.long(), units)
-        return to_cpu(total) / kernels.UNITS
+        return _px_by_label(units, self.pairs.labels.long(), len(self.classes))
 
     def _shares(self, likelihood: np.ndarray, rest: np.ndarray) -> VoteShares:
         shares = self.shared(on_device(likelihood, self._pair.device), rest)
@@ -171,9 +170,14 @@ class GPUObservation(Observation):
             self._slots, self._label_start, self._slot_start, self._weights, self._pair, likelihood,
             of_labels[present], logs, left_over, sums,
         )  # fmt: skip
-        total = torch.zeros(len(rest), dtype=torch.int64, device=device).index_add_(0, present, left_over)
         pairs = (sums.double() / kernels.UNITS).float()
-        return ShareTensors(pairs, to_cpu(total) / kernels.UNITS, float(logs.sum(dtype=torch.float64)))
+        of_rest = _px_by_label(left_over, present, len(rest))
+        return ShareTensors(pairs, of_rest, float(logs.sum(dtype=torch.float64)))
+
+
+def _px_by_label(units: torch.Tensor, labels: torch.Tensor, count: int) -> np.ndarray:  # (S,) int64, (S,)
+    """Add up units by label, in px, (L,) float64."""
+    return kernels.in_px(units.new_zeros((count, 2)).index_add_(0, labels, kernels.halves(units)))
 
 
 def _cut(mask: torch.Tensor, tiles: TileTensors) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:

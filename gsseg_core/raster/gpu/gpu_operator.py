@@ -70,8 +70,7 @@ class GPUOperator(ViewOperator):
 
     def blend_seen(self, codes: np.ndarray, wanted: np.ndarray | None = None) -> Blended:
         """Blend codes (M, K) of what is visible; all pixels, whatever is wanted."""
-        del wanted
-        self._check_rows(len(codes), self.ids)
+        self._check_rows(len(codes), self.ids, wanted)
         return _to_cpu(*self.blend_there(on_device(codes.astype(np.float32, copy=False), self._device)))
 
     def blend_rows(self, codes: CSRRows, num_classes: int, of: np.ndarray | None = None) -> Blended:
@@ -83,7 +82,7 @@ class GPUOperator(ViewOperator):
         of: np.ndarray | None = None, beside: np.ndarray | None = None, wanted: np.ndarray | None = None,
     ) -> Strongest:  # fmt: skip
         """Find the class of each pixel, whatever is wanted; the image of all classes stays on the GPU."""
-        image, left_over = self.blend_there(self._dense(codes, num_classes, of))
+        image, left_over = self.blend_there(self._dense(codes, num_classes, of, wanted))
         if background:
             image[0] += left_over
         classes, known = image.argmax(dim=0).int(), image.sum(dim=0) > 0.5
@@ -93,17 +92,19 @@ class GPUOperator(ViewOperator):
         )  # fmt: skip
 
     def _dense(
-        self, codes: CSRRows | RowTensors, num_classes: int, of: np.ndarray | torch.Tensor | None
-    ) -> torch.Tensor:
+        self, codes: CSRRows | RowTensors, num_classes: int, of: np.ndarray | torch.Tensor | None,
+        wanted: np.ndarray | None = None,
+    ) -> torch.Tensor:  # fmt: skip
         """Write codes of `ids` out by class on the GPU, (M, K); `of` as in `blend_rows`. Both may be there already."""
-        self._check_rows(len(codes.indptr) - 1, of)
+        self._check_rows(len(codes.indptr) - 1, of, wanted)
         rows = RowTensors.kept(codes, self._device) if isinstance(codes, CSRRows) else codes
         ids = self.tiles.ids.long()
         if of is not None:
             of = on_device(of, self._device) if isinstance(of, np.ndarray) else of
-            place = torch.zeros(self.num_gaussians, dtype=torch.int64, device=self._device)
+            place = torch.full((self.num_gaussians,), -1, dtype=torch.int64, device=self._device)
             place[of.long()] = torch.arange(len(of), device=self._device)
             ids = place[ids]
+        self._check_codes(rows.indices, num_classes, ids)
         return rows.dense(ids, num_classes)
 
     def blend_there(self, codes: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:  # (M, K)
@@ -170,6 +171,7 @@ class GPUOperator(ViewOperator):
 
     def objects_alone(self, labels: np.ndarray) -> ObjectsAlone:
         """Choose the Gaussians that belong to an object."""
+        self._check_rows(len(labels), None, what="labels")
         return GPUObjects.of(self.tiles, labels)
 
     def _observe(self, labels: np.ndarray, weights: np.ndarray | None) -> Observation:

@@ -10,6 +10,7 @@ import math
 from typing import Any
 
 import numpy as np
+import torch
 
 from gsseg_core.raster.constants import BLOCK, TINY
 from gsseg_core.raster.gpu.blending import (
@@ -27,7 +28,7 @@ from gsseg_core.raster.gpu.blending import (
     pixel_in,
     weigh_batch,
 )
-from gsseg_core.raster.gpu.device import called_by_kernels, cuda, gpu_kernel
+from gsseg_core.raster.gpu.device import called_by_kernels, cuda, gpu_kernel, to_cpu
 
 UNITS = 2.0**24
 """Units of a px in sums."""
@@ -37,6 +38,17 @@ _MOST = np.float32(2.0**26)
 
 _TINY = np.float32(TINY)
 _NOTHING = np.float32(0)
+
+
+def halves(units: torch.Tensor) -> torch.Tensor:  # int64 of at least 0
+    """Cut numbers of units in two, (..., 2): of megapixels that hardly anything explains, 64 bits hold no sum."""
+    return torch.stack([units >> 32, units & 0xFFFFFFFF], dim=-1)
+
+
+def in_px(sums: torch.Tensor) -> np.ndarray:  # (..., 2) int64
+    """Put sums of halves together, in px, float64."""
+    high, low = np.moveaxis(to_cpu(sums), -1, 0)
+    return np.asarray((high * 2.0**32 + low) / UNITS)
 
 
 @gpu_kernel

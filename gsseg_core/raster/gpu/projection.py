@@ -15,7 +15,7 @@ import torch
 from gsseg_core.raster.constants import DILATION, NEAR
 from gsseg_core.raster.cpu.projection import HALF_LOG2E, LARGEST_REACH, REACH_MAX, ROOT, Pinhole
 from gsseg_core.raster.cpu.splat import HEIGHT, LOG_ALPHA_MIN, LOG_OPACITY, SHEAR, WIDTH, X_TURN, Y_REACH, U, V
-from gsseg_core.raster.cpu.tiling import TILE
+from gsseg_core.raster.cpu.tiling import TILE, check_entries
 from gsseg_core.raster.gpu.device import called_by_kernels, cuda, gpu_kernel, launch, on_device
 from gsseg_core.raster.gpu.tensors import starts
 from gsseg_core.scene.camera import Camera
@@ -85,6 +85,7 @@ def project(scene: GaussianScene, camera: Camera, device: torch.device) -> TileT
     table, touched = table[seen].contiguous(), touched[seen]
     gaussian_start = starts(touched)
     total = int(gaussian_start[-1])
+    check_entries(total, camera.width, camera.height)  # PyTorch sorts no more either.
     # Tiles that fit 16 bits are sorted in half the passes.
     small = torch.int16 if columns * rows < 1 << 15 else torch.int32
     tiles = torch.empty(total, dtype=small, device=device)

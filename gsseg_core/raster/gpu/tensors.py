@@ -52,7 +52,7 @@ class RowTensors(NamedTuple):
         rows = torch.repeat_interleave(torch.arange(len(ids), device=ids.device), counts)
         entries = self._entries_of(ids, starts(counts))
         dense = torch.zeros((len(ids), num_classes), device=ids.device)
-        dense[rows, self.indices[entries].long()] = self.data[entries]
+        dense[rows, self.indices[entries].long()] = self.data[entries].float()
         return dense
 
     def _entries_of(self, ids: torch.Tensor, indptr: torch.Tensor) -> torch.Tensor:  # (M,), (M + 1,)
