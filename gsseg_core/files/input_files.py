@@ -199,8 +199,27 @@ def decode_image(
             warnings.simplefilter("ignore", Image.DecompressionBombWarning)
             image = Image.open(file, formats=formats)
         check_pixels(*image.size, source, error)
+        if image.format == "PNG":
+            _check_png(file)
         yield image
     except DAMAGED as cause:
         # Of what it does not know, Pillow tells nothing but the address of the object that it was handed.
         why = "of no known format" if isinstance(cause, UnidentifiedImageError) else reason(cause)
         raise error(f"{source}: broken {kind} ({why}); expected {expected}") from cause
+
+
+def _check_png(file: IO[bytes]) -> None:
+    """Raise `ValueError` where pixels of a PNG are not as its checksums say, which Pillow does not compare."""
+    place = file.tell()
+    file.seek(8)
+    # Chunks whose name has a small first letter have no say in what the pixels are.
+    while len(head := file.read(8)) == 8 and (kind := head[4:]) != b"IEND":
+        left, checksum = int.from_bytes(head[:4], "big"), zlib.crc32(kind)
+        if not kind[:1].isupper():
+            file.seek(left + 4, os.SEEK_CUR)
+            continue
+        while left and (block := file.read(min(left, 1 << 20))):
+            left, checksum = left - len(block), zlib.crc32(block, checksum)
+        if file.read(4) != checksum.to_bytes(4, "big"):
+            raise ValueError(f"chunk {kind.decode('latin-1')} is not as its checksum says")
+    file.seek(place)

@@ -74,6 +74,28 @@ def test_a_truncated_mask_is_refused(tmp_path: Path) -> None:
             read_mask(tmp_path / "mask.png")
 
 
+def test_a_mask_with_one_flipped_bit_is_refused_or_read_as_it_was(tmp_path: Path) -> None:
+    path, labels = tmp_path / "mask.png", np.arange(64, dtype=np.int32).reshape(8, 8)
+    write_mask(path, labels, 8, run="noted by its run")
+    whole, same = path.read_bytes(), 0
+    for bit in range(8 * len(whole)):
+        flipped = bytearray(whole)
+        flipped[bit // 8] ^= 1 << bit % 8
+        path.write_bytes(flipped)
+        try:
+            np.testing.assert_array_equal(read_mask(path).labels, labels)
+            same += 1
+        except MaskFormatError as error:
+            assert str(error).startswith(f"{path}: ") and str(error).isprintable()
+    assert same > 0  # in the text of the run, which says nothing of pixels
+    flipped = bytearray(whole)
+    flipped[whole.index(b"IDAT") + 20] ^= 1
+    path.write_bytes(flipped)
+    said = r"mask\.png: broken PNG \(chunk IDAT is not as its checksum says\); expected a whole label image"
+    with pytest.raises(MaskFormatError, match=said):
+        read_mask(path)
+
+
 def test_a_missing_mask_is_named(tmp_path: Path) -> None:
     with pytest.raises(MaskFormatError, match=r"nowhere\.png: cannot be read \(No such file or directory\)"):
         read_mask(tmp_path / "nowhere.png")
