@@ -18,6 +18,7 @@ from gsseg_core.data.class_names import class_name
 from gsseg_core.data.label_images import UNKNOWN, read_mask
 from gsseg_core.data.mask_formats.masks import MaskSet
 from gsseg_core.errors import MaskFormatError, MaskSizeError, NoUsableViewsError
+from gsseg_core.files.input_files import list_folder
 from gsseg_core.files.limits import MAX_LABEL
 from gsseg_core.files.run_folder import settle
 from gsseg_core.scene.camera import Camera
@@ -225,7 +226,7 @@ def evaluate_masks(pred_dir: str | Path, masks: MaskSet, cameras: Iterable[Camer
 def predicted_maps(folder: str | Path) -> list[Path]:
     """List the label maps `<stem>.png` that `gsseg render` or the like wrote, or raise `NoUsableViewsError`."""
     settle(Path(folder))
-    predictions = sorted(Path(folder).glob("*.png"))
+    predictions = [path for path in list_folder(Path(folder), NoUsableViewsError, None) if path.suffix == ".png"]
     if not predictions:
         raise NoUsableViewsError(f"{folder}: found no predictions; expected label images <stem>.png")
     return predictions

@@ -13,16 +13,16 @@ from typing import NamedTuple, TypeVar
 import numpy as np
 
 from gsseg_core.csr_rows import CSRRows, largest
-from gsseg_core.data.class_names import class_name
+from gsseg_core.data.class_names import check_class_names, class_name
 from gsseg_core.data.object_tree import ObjectTree
 from gsseg_core.data.view import spread
 from gsseg_core.errors import SettingsError, StateMismatchError
 from gsseg_core.files.limits import MAX_LABEL
 from gsseg_core.files.npz_files import (
-    COLDEST,
     UnfitError,
     check_evidence,
     check_shares,
+    check_temperature,
     class_names_of,
     open_npz,
     temperature_of,
@@ -42,7 +42,6 @@ from gsseg_core.spatial.row_order import take_rows
 from gsseg_core.text import clipped
 
 T = TypeVar("T")
-
 UNOBSERVED, REMOVED = -1, -2
 """Labels of Gaussians of which nothing is known, and of those that the filter or carving took out."""
 
@@ -114,7 +113,8 @@ class Segmentation:
             Class probabilities, which sum to 1; a row of zeros where nothing is known. Other values raise
             `SettingsError`, and another N `StateMismatchError`.
         class_names : mapping from id to name
-            Classes without a name get one like "class_07"; ids that are not 0 to K - 1 raise `SettingsError`.
+            Classes without a name get one like "class_07". Ids that are not 0 to K - 1 raise `SettingsError`, and so do
+            names that are not one line of text.
         settings : RefineSettings, optional
             Without the filter by default. What needs views is left to `carved`.
         evidence : (N,) float32, optional
@@ -130,6 +130,7 @@ class Segmentation:
             raise StateMismatchError(f"codes are {codes.shape}, evidence {px.shape}; expected ({n}, K) and ({n},)")
         if not (columns := range(codes.shape[1])) or not class_names.keys() <= {*columns}:
             raise SettingsError(f"class names have ids {clipped([*class_names])}; expected some of {columns}")
+        check_class_names(class_names, SettingsError)
         check_shares("codes", codes, SettingsError)
         check_evidence(px, SettingsError)
         result = cls.unfiltered(scene, codes, class_names, settings, None if evidence is None else px)
@@ -172,8 +173,7 @@ class Segmentation:
         What blends into a view are always the shares that were learnt; a pixel's probability is what they blend to, at
         this temperature, from 0.001 to 1000, as files hold it; else `SettingsError`.
         """
-        if not COLDEST <= temperature <= 1 / COLDEST:
-            raise SettingsError(f"temperature is {temperature}; expected a number from {COLDEST:g} to {1 / COLDEST:g}")
+        temperature = check_temperature(temperature, SettingsError)
         change = temperature / self.temperature
         return replace(self, probabilities=tempered(self.probabilities, change), temperature=temperature)
 

@@ -177,6 +177,8 @@ def test_folders_that_cannot_be_compared_are_refused_with_one_clear_error(tmp_pa
     pred, truth = tmp_path / "pred", tmp_path / "truth"
     with pytest.raises(NoUsableViewsError, match="pred: found no predictions"):
         evaluate_folders(pred, truth)
+    with pytest.raises(NoUsableViewsError, match=r"ppp: cannot be read \(File name too long"):
+        evaluate_folders(tmp_path / ("p" * 300), truth)
     write_mask(pred / "a.png", np.zeros((2, 2), int), bits=8)
     with pytest.raises(MaskFormatError, match=r"truth: found no a\.png \(1 of 1 are missing\)"):
         evaluate_folders(pred, truth)

@@ -15,6 +15,7 @@ from gsseg_core.errors import SettingsError, StateFileError, StateMismatchError,
 from gsseg_core.export.class_files import export_classes
 from gsseg_core.learn.temperature import tempered
 from gsseg_core.learn.vote_learner import VoteLearner
+from gsseg_core.live.session import LiveSession
 from gsseg_core.objects.oriented_boxes import object_boxes
 from gsseg_core.objects.removal import left_without, without_objects
 from gsseg_core.raster.backends import make_operator
@@ -32,6 +33,22 @@ def test_a_temperature_that_is_none_is_refused(temperature: float) -> None:
         Segmentation.from_codes(SCENE, codes, NAMES).calibrated(temperature)
     with pytest.raises(SettingsError, match=r"temperature is .*; expected a number above 0"):
         tempered(codes, temperature)
+
+
+def test_a_result_calibrated_by_a_number_of_numpy_is_saved_and_loaded(tmp_path: Path) -> None:
+    result = Segmentation.from_codes(SCENE, CODES, NAMES).calibrated(np.float32(0.5))
+    result.save(tmp_path / "it.npz")
+    assert Segmentation.load(tmp_path / "it.npz", SCENE).temperature == 0.5
+
+
+@pytest.mark.parametrize("name", ["two\nlines", "\x1b[31mred", "\ud800", " ", "x" * 201, 7, None])
+def test_a_name_of_a_class_that_is_not_one_line_of_text_is_refused(name: str) -> None:
+    for use in (
+        lambda: Segmentation.from_codes(SCENE, CODES, {1: name}), lambda: LiveSession(SCENE, class_names={1: name}),
+    ):  # fmt: skip
+        with pytest.raises(SettingsError, match=r"class names: id 1 has the name .*; expected ") as caught:
+            use()
+        assert str(caught.value).isprintable()
 
 
 def test_labels_are_the_largest_probability_and_minus_one_where_nothing_is_known() -> None:

@@ -67,6 +67,13 @@ def check_same_names(
             raise error(f"{source}: calls class {k} {quoted(here)}; expected {quoted(there)}, as in {where}")
 
 
+def check_class_names(names: Mapping[int, str], error: type[GssegError]) -> None:
+    """Raise `error` unless every name of a class is one line of text."""
+    for k, name in names.items():
+        if flaw := flaw_of_class_name(name):
+            raise error(f"class names: id {k} has the name {flaw}")
+
+
 def flaw_of_class_name(name: object) -> str:
     """Say what is wrong with the name of a class, as the end of "has the name ...", or "" if it is usable."""
     if not isinstance(name, str) or not name.strip():

@@ -130,9 +130,14 @@ def whole_number(value: object, what: str, least: int, most: int) -> int:
 
 def temperature_of(header: dict[str, Any]) -> float:
     """Read the temperature of probabilities from a JSON header; 1 where there is none, as in files of old."""
-    value = header.get("temperature", 1.0)
-    if type(value) not in (int, float) or not COLDEST <= value <= 1 / COLDEST:
-        raise UnfitError(f"temperature is {quoted(value)}; expected a number from {COLDEST:g} to {1 / COLDEST:g}")
+    return check_temperature(header.get("temperature", 1.0))
+
+
+def check_temperature(value: Any, unfit: type[Exception] = UnfitError) -> float:
+    """Return a temperature of probabilities; raise `unfit` unless it is a number that files hold as one."""
+    is_number = isinstance(value, int | float | np.integer | np.floating) and not isinstance(value, bool)
+    if not is_number or not COLDEST <= value <= 1 / COLDEST:
+        raise unfit(f"temperature is {quoted(value)}; expected a number from {COLDEST:g} to {1 / COLDEST:g}")
     return float(value)
 
 

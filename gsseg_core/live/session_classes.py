@@ -5,9 +5,9 @@ from __future__ import annotations
 import os
 from collections.abc import Mapping
 
-from gsseg_core.data.class_names import BACKGROUND_NAME, check_same_names, class_name, names_together
+from gsseg_core.data.class_names import BACKGROUND_NAME, check_class_names, check_same_names, class_name, names_together
 from gsseg_core.data.dataset import Dataset
-from gsseg_core.errors import ClassesFileError, StateFileError, UnknownLabelError
+from gsseg_core.errors import ClassesFileError, SettingsError, StateFileError, UnknownLabelError
 from gsseg_core.files.limits import MAX_LABEL
 from gsseg_core.learn.learner_state import State
 
@@ -19,6 +19,7 @@ class SessionClasses:
     """Classes of a session: those that were declared by names and no others, or else those that turn up."""
 
     def __init__(self, declared: Mapping[int, str] | None, max_classes: int) -> None:
+        check_class_names(declared or {}, SettingsError)
         self.declared, self._max_classes = bool(declared), max_classes  # the latter counts where none were declared
         self.names = {0: BACKGROUND_NAME, **(declared or {})}  # as far as they are known; replaced and never changed
 

@@ -216,19 +216,26 @@ class ObjectTable:
         """Return a view as it came, with the numbers of objects for labels; ids that lie on no Gaussian are unknown.
 
         A view that `add` would not take comes back with nothing but background and unknown pixels, or as it is if it
-        has no mask, so that a learner rejects it for the right reason.
+        has no mask, so that a learner rejects it for the right reason. Raises `SettingsError` where a view was added
+        and `solve` has not come yet.
         """
         lifted = self._lifted.get(view.name)
         if lifted is None:
             return _without_labels(view)
         labels = self.views[view.name].read_labels()
         table = np.full(int(labels.max()) + 2, UNKNOWN, np.int32)  # The last one is for unknown pixels.
-        table[lifted.ids] = self._objects[view.name]
+        table[lifted.ids] = self._numbers(view.name)
         return replace(View.from_arrays(view.camera, table[labels]), image_path=view.image_path)
 
     def objects_in(self, name: str) -> ViewObjects:
-        """Which object each id of a view stands for, and how many ids do not fit."""
-        lifted, objects = self._lifted[name], self._objects[name]
+        """Which object each id of a view stands for, and how many ids do not fit; raises as `relabelled` and `remove`.
+
+        A view that was set aside has no ids.
+        """
+        self._require(name)
+        if not self.sees(name):
+            return ViewObjects({}, merged=0, split=0)
+        lifted, objects = self._lifted[name], self._numbers(name)
         shown = objects[objects > 0]
         parts, _ = self._profiles.common(lifted)
         parts[:, 0], parts[lifted.ids == 0] = 0, 0
@@ -259,6 +266,12 @@ class ObjectTable:
     def _require(self, name: str) -> None:
         if name not in self.views:
             raise SettingsError(f"view {name!r} was not added; there are {len(self.views)} others")
+
+    def _numbers(self, name: str) -> np.ndarray:
+        """Return the object of each id of a view that counts, or raise `SettingsError` before it was given one."""
+        if name not in self._objects:
+            raise SettingsError(f"view {name!r} was added, and its objects are not known yet; expected solve() first")
+        return self._objects[name]
 
     def _lift(self, view: View) -> tuple[Lifted, Observation] | None:
         """Lift the segments of a view to the Gaussians; None where it has no labels or sees no Gaussian."""

@@ -64,6 +64,18 @@ def test_views_that_are_not_there_and_votes_that_are_none_are_refused_and_nothin
     np.testing.assert_array_equal(table.relabelled(VIEWS[0]).read_labels(), before)
 
 
+def test_a_view_of_which_no_objects_are_known_has_none_or_is_refused() -> None:
+    table = ObjectTable(SCENE)
+    table.set_aside(VIEWS[0])
+    assert table.objects_in(VIEWS[0].name).objects == {}
+    with pytest.raises(SettingsError, match="view 'nowhere' was not added; there are 1 others"):
+        table.objects_in("nowhere")
+    table.add(VIEWS[1])
+    for use in (lambda: table.objects_in(VIEWS[1].name), lambda: table.relabelled(VIEWS[1])):
+        with pytest.raises(SettingsError, match=r"its objects are not known yet; expected solve\(\) first"):
+            use()
+
+
 def test_what_is_found_does_not_depend_on_the_order_of_the_views() -> None:
     views = [shuffled(in_halves(view, 1 + i % 3)) for i, view in enumerate(VIEWS)]
     lifted = {v.name: Lifted.of(make_operator(SCENE, v.camera).observe(v.read_labels())) for v in views}
