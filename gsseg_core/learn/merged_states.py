@@ -59,7 +59,7 @@ def merge_states(saved: Sequence[Saved]) -> State:  # at least one
             raise StateFileError(
                 f"{one.source}: {OBJECTS_OF_ONE_SESSION}; expected classes whose ids mean the same in all states"
             )
-        one.state.check_names(names, one.source, "in the states before it")
+        one.state.check_names(names, one.source, "the states before it")
         names = names_together(names, one.state.class_names)
         for other in saved[:number]:
             if _brings_nothing(one.state, other.state):
