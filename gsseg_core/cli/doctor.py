@@ -31,13 +31,14 @@ Prints the versions of gsseg, Python and its packages, the devices, whether the 
 the formats that are read, which extras are installed, and what there is of ROS 2. For all that is missing it says what
 to type. The exit code is 0 if gsseg works, with or without extras, and 2 if not.
 
-Of a scene it prints its format instead, and what this format keeps of a Gaussian. Of a dataset with --scene it prints
-whether the cameras fit the scene (exit code 0), and if not (2), which axes, scale, rotation and translation make them
-fit.
+Of a scene it prints its format instead, and what this format keeps of a Gaussian. Of a dataset it reads cameras and
+masks, and prints what is there. With --scene it prints whether the cameras fit the scene (exit code 0), and if not
+(2), which axes, scale, rotation and translation make them fit.
 """
 EXAMPLES = """
   gsseg doctor
   gsseg doctor scan.spz
+  gsseg doctor DATASET
   gsseg doctor DATASET --scene scene.ply
 """
 
@@ -75,7 +76,7 @@ class Finding:
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare what the command takes."""
-    what = "a scene, to print its format; with --scene, a dataset, to see whether its cameras fit"
+    what = "a scene, to print its format; or a dataset, to read it, and with --scene to see whether its cameras fit"
     parser.add_argument("path", nargs="?", metavar="PATH", help=what)
     parser.add_argument("--scene", metavar="SCENE", help="trained scene that cameras of the dataset PATH should fit")
     labels = "the dataset's folder of masks, which are looked at where there are no photos (default: labels)"
@@ -94,7 +95,8 @@ def run(options: argparse.Namespace) -> int:
     if options.scene:
         return _examine_frame(options)
     if options.path:
-        tell(_listed(examine_scene(options.path)))
+        dataset = examine_dataset(options.path, options.labels)
+        tell(_listed(dataset or examine_scene(options.path)))
         return 0
     findings = examine(note)
     tell(describe(findings))
@@ -143,6 +145,32 @@ def examine_scene(path: str) -> list[Finding]:
         Finding(name, "keeps", known.keeps, ""),
         *remarks,
         Finding(name, "order", "labels are in the order of this file", ""),
+    ]
+
+
+def examine_dataset(path: str, labels: str) -> list[Finding]:
+    """Read the cameras and all masks of a dataset, and say what is there; nothing of a path without cameras.
+
+    Raises what `Dataset` and `View.read_seen` raise.
+    """
+    from gsseg_core.data.camera_formats.table import CAMERA_FORMATS
+    from gsseg_core.data.dataset import Dataset
+    from gsseg_core.text import clipped, counted
+
+    known = next((known for known in CAMERA_FORMATS if os.path.isdir(path) and known.find(Path(path))), None)
+    if known is None:
+        return []
+    dataset, name = Dataset(path, labels), clipped(path)
+    masked = [view for view in dataset.views() if view.has_mask]
+    for view in masked:
+        view.read_seen()
+    train, test = (len(dataset.views(split)) for split in ("train", "test"))
+    mark, fix = ("ok", "") if masked else ("-", "gsseg segment takes their place by --labels PATH")
+    told = f"of {counted(len(masked), 'view')}; all can be read" if masked else f"none in {clipped(labels)}"
+    return [
+        Finding(name, "cameras", f"{known.name}: {train} to learn from, {test} to test"),
+        Finding(name, "masks", told, mark, fix),
+        Finding(name, "scene", "not looked at", "", f"gsseg doctor {name} --scene SCENE tells whether cameras fit"),
     ]
 
 

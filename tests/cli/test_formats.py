@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+import shutil
 from pathlib import Path
 
 import numpy as np
 import pytest
 from scene_files import some_scene, write_glb, write_gsplat, write_spz
-from small_scenes import NAMES, NUM_CLASSES, balls_on_a_table, clean_views, taught
+from small_scenes import NAMES, NUM_CLASSES, balls_on_a_table, clean_views, taught, write_dataset
 
 from gsseg_core.cli.main import main
 from gsseg_core.data.camera_files import read_cameras
@@ -84,6 +85,23 @@ def test_doctor_says_of_a_scene_its_format_and_what_of_it_is_lost(
     (tmp_path / "scan.spz").write_bytes(b"NGSP")
     assert main(["doctor", str(tmp_path / "scan.spz")]) == 2
     assert "scan.spz: header: 4 bytes are there" in capsys.readouterr().err
+
+
+def test_doctor_reads_all_masks_of_a_dataset_and_says_that_it_looked_at_no_scene(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    root = write_dataset(tmp_path / "data")
+    assert main(["doctor", str(root)]) == 0
+    told = capsys.readouterr().out
+    assert "3DGS: 4 to learn from, 2 to test" in told and "of 6 views; all can be read" in told
+    assert "scene    not looked at" in told and f"gsseg doctor {root} --scene SCENE" in told
+    mask = root / "labels/view3.png"
+    mask.write_bytes(mask.read_bytes()[:-30])
+    assert main(["doctor", str(root)]) == 2
+    assert f"{mask}: broken" in capsys.readouterr().err
+    shutil.rmtree(mask.parent)
+    assert main(["doctor", str(root)]) == 0
+    assert "none in labels" in capsys.readouterr().out
 
 
 def test_a_scene_of_another_format_is_segmented_as_its_ply_is(tmp_path: Path) -> None:
