@@ -8,15 +8,15 @@ for (const field of document.querySelectorAll(".search")) {
     for (const row of document.querySelectorAll(field.dataset.rows)) {
       row.hidden = !row.querySelector("bdi").textContent.toLowerCase().includes(wanted);
     }
+    const found = document.querySelectorAll(`${field.dataset.rows}:not([hidden], .elsewhere)`).length;
+    field.nextElementSibling.textContent = wanted && `${found} found`;
   });
 }
 (() => {
   const canvas = document.querySelector(".stage canvas");
+  const say = (text) => document.querySelector("#preview").insertAdjacentText("beforeend", text);
   const gl = canvas.getContext("webgl2", { antialias: true, alpha: false });
-  if (!gl) {
-    document.querySelector("#preview").insertAdjacentText("beforeend", "The preview in 3D needs WebGL 2, which this browser does not offer.");
-    return;
-  }
+  if (!gl) return say("The preview in 3D needs WebGL 2, which this browser does not offer.");
   const data = JSON.parse(document.getElementById("preview-data").textContent);
   const records = Uint8Array.from(atob(document.getElementById("preview-records").textContent), (c) => c.charCodeAt(0));
 
@@ -225,11 +225,13 @@ for (const field of document.querySelectorAll(".search")) {
   function showLevel() {
     const { name, shown } = level();
     document.querySelector(".level-name").textContent = name;
+    levelSlider.setAttribute("aria-valuetext", name);
     for (const box of boxes) {
       const label = Number(box.dataset.label);
       box.closest("li").classList.toggle("elsewhere", label < unobserved && !shown.includes(label));
     }
     legend.classList.toggle("many", inColumns && name === "objects");  // Names of parts are long.
+    document.querySelector("#preview .search").dispatchEvent(new Event("input"));  // It says how many it finds.
     check(() => true);
   }
   levelSlider?.addEventListener("input", showLevel);
@@ -312,8 +314,10 @@ for (const field of document.querySelectorAll(".search")) {
     zoom(Math.exp(event.deltaY * (event.deltaMode ? 0.05 : 0.0015)));
   }, { passive: false });
   canvas.addEventListener("keydown", (event) => {
+    if (event.ctrlKey || event.metaKey || event.altKey) return;  // The browser's own: its zoom, the page before.
+    const steer = event.shiftKey ? move : turn;
     const action = {
-      ArrowLeft: () => turn(20, 0), ArrowRight: () => turn(-20, 0), ArrowUp: () => turn(0, 20), ArrowDown: () => turn(0, -20),
+      ArrowLeft: () => steer(20, 0), ArrowRight: () => steer(-20, 0), ArrowUp: () => steer(0, 20), ArrowDown: () => steer(0, -20),
       "+": () => zoom(0.9), "=": () => zoom(0.9), "-": () => zoom(1 / 0.9),
     }[event.key];
     if (!action) return;
@@ -324,7 +328,11 @@ for (const field of document.querySelectorAll(".search")) {
   new ResizeObserver(redraw).observe(canvas);
   matchMedia("(prefers-color-scheme: dark)").addEventListener("change", redraw);
   document.documentElement.classList.add("js");
+  // A driver that starts anew takes all that was drawn with it.
+  canvas.addEventListener("webglcontextlost", () => {
+    document.documentElement.classList.remove("js");
+    say("The browser has lost the preview in 3D. It is there again when the page is loaded anew.");
+  });
   look(0);
-  if (levelSlider) levelSlider.value = levelSlider.defaultValue;  // Some browsers keep it when a page is loaded again.
   showClasses();
 })();

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import re
+from functools import partial
 from io import BytesIO
 from typing import TYPE_CHECKING
 
@@ -121,9 +123,11 @@ def test_preview_turns_moves_zooms_and_cuts(opened: Page) -> None:
 def test_a_search_leaves_the_classes_whose_names_have_the_word(opened: Page) -> None:
     for section, rows in (("#classes", ".classes tbody tr"), ("#preview", ".legend li")):
         opened.locator(f"{section} .search").fill("SCRIPT")
-        assert 0 < opened.locator(f"{rows}:visible").count() < opened.locator(rows).count()
+        assert 0 < (found := opened.locator(f"{rows}:visible").count()) < opened.locator(rows).count()
+        assert opened.locator(f"{section} output.faint").text_content() == f"{found} found"
         opened.locator(f"{section} .search").fill("")
         assert opened.locator(f"{rows}:visible").count() == opened.locator(rows).count() > 1
+        assert opened.locator(f"{section} output.faint").text_content() == ""
 
 
 def test_nasty_names_do_nothing(opened: Page) -> None:
@@ -133,12 +137,14 @@ def test_nasty_names_do_nothing(opened: Page) -> None:
     assert opened.locator("#classes bdi").nth(1).inner_text() == "<script>document.title='pwned'</script>"
 
 
-@pytest.mark.parametrize("scheme", ["light", "dark"])
-def test_a_phone_shows_all_of_it_without_scrolling_sideways(chromium: Browser, report: str, scheme: str) -> None:
-    with opened_page(chromium, 360, 740, color_scheme=scheme) as page:
+@pytest.mark.parametrize(("scheme", "width"), [("light", 320), ("dark", 360)])
+def test_a_phone_shows_all_of_it_without_scrolling_sideways(
+    chromium: Browser, report: str, scheme: str, width: int
+) -> None:
+    with opened_page(chromium, width, 740, color_scheme=scheme) as page:
         page.goto(report)
         page.wait_for_selector(f"{CANVAS}[data-frames]")
-        assert page.evaluate("document.documentElement.scrollWidth") <= 360
+        assert page.evaluate("document.documentElement.scrollWidth") <= width
         paper = [
             int(x) for x in page.evaluate("getComputedStyle(document.body).backgroundColor").strip("rgb()").split(",")
         ]
@@ -164,8 +170,91 @@ def test_long_names_and_many_classes_break_no_figure_and_make_no_page_wider(
         assert page.locator(".classes.many").count() == 1
         assert page.evaluate("document.documentElement.scrollWidth") <= width
         assert page.evaluate(broken) == []
-        whole = page.locator("td.name:has-text('object_007')").evaluate("name => name.scrollWidth <= name.clientWidth")
+        whole = page.locator("th.name:has-text('object_007')").evaluate("name => name.scrollWidth <= name.clientWidth")
         assert whole, "the names that objects get are told apart by their end"
+
+
+def test_keys_move_the_scene_and_leave_the_browser_its_own(opened: Page) -> None:
+    canvas = opened.locator(CANVAS)
+    canvas.focus()
+    pressed = ("ArrowLeft", "ArrowRight", "ArrowRight", "ArrowLeft", "Shift+ArrowRight", "Shift+ArrowLeft")
+    _, here, turned, back, moved, again = (after(opened, partial(opened.keyboard.press, key)) for key in pressed)
+    assert min(changed(one, other) for one, other in ((here, turned), (here, moved), (turned, moved))) > 0.005
+    assert max(changed(here, back), changed(here, again)) < 0.002
+    for key, held in (("+", "ctrlKey"), ("-", "ctrlKey"), ("-", "metaKey"), ("ArrowLeft", "altKey")):
+        press = f"new KeyboardEvent('keydown', {{key: '{key}', {held}: true, cancelable: true}})"
+        assert canvas.evaluate(f"canvas => canvas.dispatchEvent({press})"), "the browser's zoom, or the page before"
+
+
+def test_a_screen_reader_is_told_what_everything_is(opened: Page) -> None:
+    assert opened.get_by_role("application", name="shift they move it").count() == 1
+    assert opened.get_by_role("region", name="matrix of confusions").count() == 1
+    assert opened.get_by_role("group", name="classes to show").get_by_role("button").count() == 2
+    for table in (".classes", ".views", ".timings"):
+        rows = opened.locator(f"{table} tbody tr")
+        assert opened.locator(f"{table} tbody th[scope=row]").count() == rows.count() > 0, table
+    assert opened.locator("td.share [role=img]").count() == 0, "the figure stands beside the bar"
+    told = opened.locator(".chart").get_attribute("aria-label") or ""
+    labelled = sum(int(count.replace(",", "")) for count in re.findall(r"up to [\d.]+: ([\d,]+?)(?:, |$)", told))
+    drawn = re.findall(r": ([\d,]+) ", " ".join(opened.locator(".chart title").all_text_contents()))
+    assert labelled == sum(int(count.replace(",", "")) for count in drawn) > 0
+
+
+@pytest.mark.parametrize("scheme", ["light", "dark"])
+def test_all_text_stands_out_from_what_is_behind_it(chromium: Browser, report: str, scheme: str) -> None:
+    with opened_page(chromium, color_scheme=scheme) as page:
+        page.goto(report)
+        page.wait_for_selector(f"{CANVAS}[data-frames]")
+        faint = page.evaluate("""() => {
+          const parts = (color) => color.match(/[\\d.]+/g).map(Number);
+          const luminance = (color) => parts(color).slice(0, 3).map((c) => c / 255)
+            .map((c) => (c <= 0.04045 ? c / 12.92 : ((c + 0.055) / 1.055) ** 2.4))
+            .reduce((sum, c, i) => sum + c * [0.2126, 0.7152, 0.0722][i], 0);
+          const behind = (place) => {
+            const color = getComputedStyle(place).backgroundColor;
+            return parts(color)[3] === 0 ? behind(place.parentElement) : color;
+          };
+          const found = [];
+          for (const place of document.querySelectorAll("body *:not(script, .hint)")) {
+            const text = [...place.childNodes].some((one) => one.nodeType === 3 && one.data.trim());
+            if (!text || !place.checkVisibility()) continue;
+            const { color, fill } = getComputedStyle(place);
+            const inks = [place instanceof SVGElement ? fill : color, behind(place)];
+            const [low, high] = inks.map(luminance).sort((a, b) => a - b);
+            if ((high + 0.05) / (low + 0.05) < 4.5) found.push(place.tagName + " " + place.textContent.slice(0, 40));
+          }
+          return found;
+        }""")
+        assert faint == []
+
+
+def test_forced_colours_leave_keys_and_what_is_pressed(chromium: Browser, report: str) -> None:
+    with opened_page(chromium, forced_colors="active") as page:
+        page.goto(report)
+        page.wait_for_selector(f"{CANVAS}[data-frames]")
+        paper = "place => getComputedStyle(place).backgroundColor"
+        pressed, other = (page.locator(f"[data-mode='{mode}']").evaluate(paper) for mode in (0, 1))
+        assert pressed != other
+        assert len({page.locator(f".keys .s{i}").evaluate(paper) for i in (0, 1)}) == 2
+
+
+def test_a_page_that_one_comes_back_to_shows_what_its_controls_say(opened: Page, report: str) -> None:
+    opened.locator(".cut").fill("70")
+    opened.locator("#classes .search").fill("script")
+    opened.locator(".legend input").first.uncheck()
+    opened.goto("about:blank")
+    opened.go_back()
+    opened.wait_for_selector(f"{CANVAS}[data-frames]")
+    opened.wait_for_timeout(300)  # A browser puts back what was typed once the page has loaded.
+    assert opened.locator(".cut").input_value() == "0" and opened.locator("#classes .search").input_value() == ""
+    assert opened.locator(".legend input:not(:checked)").count() == 0
+
+
+def test_a_preview_that_the_browser_loses_leaves_its_picture(opened: Page) -> None:
+    opened.locator(CANVAS).evaluate("c => c.getContext('webgl2').getExtension('WEBGL_lose_context').loseContext()")
+    opened.locator(".poster").wait_for()
+    assert not opened.locator(".controls").is_visible()
+    assert "loaded anew" in opened.locator("#preview").inner_text()
 
 
 def test_names_that_are_read_from_the_right_leave_sentences_in_order(opened: Page) -> None:
@@ -184,6 +273,19 @@ def test_paper_gets_dark_letters_an_undistorted_preview_and_nothing_to_press(chr
         for pressed in ("nav", ".controls", ".search", ".hint", ".only"):
             assert not any(one.is_visible() for one in page.locator(pressed).all())
         assert page.evaluate("getComputedStyle(document.querySelector('i.s0')).printColorAdjust") == "exact"
+
+
+def test_a_sheet_of_paper_has_all_classes_and_all_pictures(chromium: Browser, long_report: str) -> None:
+    with opened_page(chromium, 718, 1040) as page:  # A4 between the usual margins
+        page.goto(long_report)
+        page.wait_for_selector(f"{CANVAS}[data-frames]")
+        page.emulate_media(media="print")
+        assert page.evaluate("document.documentElement.scrollWidth") <= 718
+        for kind in (".legend", ".pictures", ".scroll"):
+            for whole in page.locator(kind).all():
+                cut = "e => Math.max(e.scrollWidth - e.clientWidth, e.scrollHeight - e.clientHeight)"
+                assert whole.evaluate(cut) <= 1, kind
+        assert page.locator(".classes th.name, .classes td.link").first.is_visible()
 
 
 def test_everything_but_the_preview_works_without_javascript(chromium: Browser, report: str) -> None:
@@ -210,9 +312,11 @@ def test_levels_recolour_the_preview_and_parts_stand_under_their_object(
     rows = page.locator(".legend li:visible bdi")
     objects, before = rows.all_text_contents(), shot(page.locator(CANVAS))
     assert page.locator(".level-name").text_content() == "objects"
+    assert page.locator(".level").get_attribute("aria-valuetext") == "objects"
     most = page.locator(".level").get_attribute("max")
     fine = after(page, lambda: page.locator(".level").fill(str(most)))
     assert page.locator(".level-name").text_content().startswith("parts at 0.")
+    assert page.locator(".level").get_attribute("aria-valuetext") == page.locator(".level-name").text_content()
     parts = [name for name in rows.all_text_contents() if name not in objects]
     assert len(parts) == 2 and {name[-2:] for name in parts} == {".1", ".2"}
     assert changed(before, fine) > 0.002
