@@ -86,9 +86,7 @@ class StagedRun:
         self.id = f"{time.strftime('%Y%m%dT%H%M%SZ', time.gmtime())}-{secrets.token_hex(4)}"
         self.out, self._kind, self._staging = out, kind, out / f".gsseg-{self.id}"
         self.folder = self._staging / "new"
-        self._made: list[
-            Path
-        ] = []  # folders above the staged one, and for its files, that were not there, innermost first
+        self._made: list[Path] = []  # folders that were not there, for the staged one and its files, innermost first
         self._lock = -1
 
     def begin(self) -> None:
