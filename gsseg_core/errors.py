@@ -118,3 +118,8 @@ class SchedulerError(GssegError):
 
 class NoCodesError(GssegError):
     """Nothing has been learnt or fused yet that could be shown or saved."""
+
+
+def memory_ran_out(error: BaseException) -> bool:
+    """Tell whether an error says that memory is not enough, that of a GPU too: PyTorch's, which may not be loaded."""
+    return isinstance(error, MemoryError) or type(error).__name__ == "OutOfMemoryError"

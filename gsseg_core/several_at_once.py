@@ -6,14 +6,16 @@ a view. Where a GPU renders, the CPU has nothing but such work of one thread, an
 
 from __future__ import annotations
 
+import traceback
 from collections import deque
 from collections.abc import Callable, Collection, Generator, Iterable, Iterator
-from concurrent.futures import Future, ThreadPoolExecutor
+from concurrent.futures import Future, ThreadPoolExecutor, wait
 from contextlib import closing, contextmanager
 from typing import TypeVar
 
 import numba
 
+from gsseg_core.errors import memory_ran_out
 from gsseg_core.progress import Progress, with_progress
 
 T = TypeVar("T")
@@ -24,25 +26,43 @@ def several_at_once(work: Callable[[T], R], items: Iterable[T], device: str = "c
     """Give what `work` makes of each item, in their order; the next ones are worked on meanwhile.
 
     The error that one of them raises comes in its turn, and the work ends. `work` may be called in several threads at
-    once; with one core, or where kernels of two threads cannot run beside each other, in none but the caller's.
+    once; with one core, or where kernels of two threads cannot run beside each other, in none but the caller's. Where a
+    GPU has not the memory for so many at once, half as many are worked on from then on, and an item that failed is
+    worked on again by itself.
     """
     threads = numba.get_num_threads()
     if threads == 1 or not kernels_run_beside_each_other():
         yield from map(work, items)
         return
     workers = 2 if device == "cpu" else threads
-    each, begun = threads // workers, deque[Future[R]]()
+    each, begun = threads // workers, deque[tuple[T, Future[R]]]()
     callers = max(each, threads // 4)
     with ThreadPoolExecutor(workers, "gsseg-view", numba.set_num_threads, (each,)) as pool:
+
+        def first_result() -> R:
+            nonlocal workers
+            item, future = begun.popleft()
+            try:
+                return future.result()
+            except Exception as error:
+                if device == "cpu" or not memory_ran_out(error):
+                    raise
+            workers = max(workers // 2, 1)
+            # What they have made of the GPU's memory is free only once nobody can look into their frames.
+            for other in (future, *wait([future for _, future in begun]).done):
+                if failed := other.exception():
+                    traceback.clear_frames(failed.__traceback__)
+            return pool.submit(work, item).result()
+
         try:
             for item in items:
-                begun.append(pool.submit(work, item))
-                if len(begun) > workers:
-                    yield from _with_threads(callers, begun.popleft().result(), threads)
+                begun.append((item, pool.submit(work, item)))
+                while len(begun) > workers:
+                    yield from _with_threads(callers, first_result(), threads)
             while begun:
-                yield from _with_threads(callers, begun.popleft().result(), threads)
+                yield from _with_threads(callers, first_result(), threads)
         finally:
-            for future in begun:
+            for _, future in begun:
                 future.cancel()
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import threading
+import weakref
 
 import numba as nb
 import numpy as np
@@ -108,6 +109,48 @@ def test_on_a_gpu_as_many_are_worked_on_as_there_are_threads(
     assert sorted(several_at_once(lambda i: (meeting.wait(), i)[1], range(8), "cuda")) == list(range(8))
     assert given.pop(threading.current_thread()) == 8
     assert set(given.values()) == {1}
+
+
+class OutOfMemoryError(RuntimeError):
+    """What PyTorch calls its own."""
+
+
+class Tensor:
+    """What takes memory of a GPU."""
+
+
+@pytest.mark.usefixtures("given")
+def test_where_a_gpu_has_not_the_memory_for_as_many_fewer_are_worked_on_and_none_is_left_out(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr("gsseg_core.several_at_once.numba.get_num_threads", lambda: 8)
+    meeting, held = threading.Barrier(8, timeout=PATIENCE), dict[int, weakref.ref[Tensor]]()
+
+    def work(i: int) -> int:
+        if i < 8 and i not in held:
+            tensor = Tensor()
+            held[i] = weakref.ref(tensor)
+            meeting.wait()
+            raise OutOfMemoryError(i)
+        assert i >= 8 or all(ref() is None for ref in held.values())
+        return i
+
+    assert list(several_at_once(work, range(12), "cuda")) == list(range(12))
+    assert len(held) == 8
+
+
+@pytest.mark.parametrize(("device", "tries"), [("cuda", 2), ("cpu", 1)])
+def test_what_no_memory_is_enough_for_is_an_error(monkeypatch: pytest.MonkeyPatch, device: str, tries: int) -> None:
+    monkeypatch.setattr("gsseg_core.several_at_once.numba.get_num_threads", lambda: 2)
+    tried = []
+
+    def work(i: int) -> None:
+        tried.append(i)
+        raise OutOfMemoryError(i)
+
+    with pytest.raises(OutOfMemoryError):
+        next(several_at_once(work, [7], device))
+    assert tried == [7] * tries
 
 
 @pytest.mark.parametrize("why", ["one thread", "kernels of one caller at a time"])

@@ -25,7 +25,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     if arguments is None:
         interrupts.leave_at_once()
     from gsseg_core.cli import terminal
-    from gsseg_core.errors import GssegError
+    from gsseg_core.errors import GssegError, memory_ran_out
 
     terminal.prepare()
     try:
@@ -40,7 +40,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     except Exception as error:
         if interrupts.was_raised():
             return interrupts.EXIT_CODE
-        if isinstance(error, MemoryError) or type(error).__name__ == "OutOfMemoryError":  # PyTorch's, of a GPU
+        if memory_ran_out(error):
             terminal.note(f"error: memory is not enough ({error}); expected smaller views, or a smaller scene")
             return 2
         if not isinstance(error, GssegError):
