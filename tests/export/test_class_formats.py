@@ -14,6 +14,7 @@ from other_readers import by_usd
 from pxr import Usd, UsdGeom, UsdPhysics, UsdSemantics
 from small_scenes import NAMES, NUM_CLASSES, balls_on_a_table
 
+from gsseg_core.data.class_names import MAX_CLASS_NAME
 from gsseg_core.errors import EmptySceneError, SettingsError
 from gsseg_core.export import class_files
 from gsseg_core.export.class_files import class_file_name, export_classes, write_selection
@@ -27,7 +28,7 @@ from gsseg_core.segmentation import Segmentation
 
 SCENE, TRUTH = balls_on_a_table()
 HOSTILE = {
-    0: "background", 1: "<script>alert(1)</script>", 2: "../../etc/passwd", 3: "x" * 300,
+    0: "background", 1: "<script>alert(1)</script>", 2: "../../etc/passwd", 3: "x" * MAX_CLASS_NAME,
 }  # fmt: skip
 
 

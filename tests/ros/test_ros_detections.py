@@ -227,7 +227,7 @@ def test_what_waited_for_its_other_part_and_was_forgotten_is_not_joined(monkeypa
 
 
 @pytest.mark.parametrize(
-    ("event", "reason"), [(("_set_back", 0), "time_jump"), (("_forget_waiting",), "scene_changed")]
+    ("event", "reason"), [(("_set_back", 9, 0), "time_jump"), (("_forget_waiting",), "scene_changed")]
 )
 def test_it_is_forgotten_when_time_goes_back_or_the_scene_is_another(
     event: tuple[Any, ...], reason: str, monkeypatch: pytest.MonkeyPatch
@@ -240,6 +240,6 @@ def test_it_is_forgotten_when_time_goes_back_or_the_scene_is_another(
         cameras={}, tf=None, detections=[joined.input], worker=Fields(clear=lambda: 0), _hand_over=lambda: None,
         _count_rejected=lambda *told: counted.append(told),
     )  # fmt: skip
-    name, *stamp = event
-    getattr(Inputs, name)(inputs, *stamp)
+    name, *stamps = event
+    getattr(Inputs, name)(inputs, *stamps)
     assert (counted, joined.input.clear()) == ([(reason, 2)], 0)
