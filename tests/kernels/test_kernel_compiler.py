@@ -115,7 +115,7 @@ warned = "no such class"
 def largest(x):
     if not len(x):
         raise ValueError(warned)
-    return np.sort(x)[-1] + np.dot(x, x)
+    return x.max() + 1
 print(largest(np.array([1.0, 2.0])))
 try:
     largest(np.empty(0))
@@ -124,7 +124,7 @@ except ValueError as error:
 """
     subprocess.run([sys.executable, "-c", "from gsseg_core.warm_up import warm_up; warm_up()"], check=True)
     done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True)
-    assert done.stdout.splitlines() == ["[]", "7.0", "no such class"]
+    assert done.stdout.splitlines() == ["[]", "3.0", "no such class"]
 
 
 def test_numba_compiles_as_it_did_after_a_kernel_that_fails(with_code: list[str]) -> None:
