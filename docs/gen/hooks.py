@@ -50,7 +50,8 @@ def on_config(config: MkDocsConfig) -> MkDocsConfig:
 
 def on_files(files: Files, config: MkDocsConfig) -> Files:
     """Add the pages that are made."""
-    texts = {"cli.md": pages.command_line(), "ros.md": pages.ros_interfaces(), "api.md": pages.python()}
+    texts = {"cli.md": pages.command_line(), "api.md": pages.python()}
+    texts["ros.md"] = relink(pages.ros_interfaces(), "msg_defs/README.md")
     for source, name in OUTSIDE.items():
         if name not in texts and name != "index.md":
             texts[name] = relink((REPOSITORY / source).read_text(encoding="utf-8"), source)
