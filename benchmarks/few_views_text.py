@@ -44,7 +44,8 @@ views. In the apartment, whose ids are shared by objects that are far apart, the
 
 Of more than 40 objects, 40 are taken evenly. "What its view sees" has no graph (`GraphSettings(strength=0)`). Like the
 rows below it, it has evidence against what is far for the object's size ([method.md](method.md#the-graph)); without,
-masks flood the rooms behind what they show. Its amount was chosen on held-out train views of the demo and the apartment.
+masks flood the rooms behind what they show. Its amount was chosen on held-out train views of the demo and the
+apartment.
 
 The **next view** is the one that sees the most of what is in doubt: the standard deviation of each Gaussian's
 membership, as far as neighbours guessed it (`Pick.next_view`). The command names it, and writes the scene as seen from
