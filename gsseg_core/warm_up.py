@@ -64,9 +64,9 @@ class _FirstCompilation(event.Listener):
 def warm_up(device: str = "cpu", say: Callable[[str], object] = lambda text: None) -> None:
     """Take some thousand Gaussians through everything that segmenting does, so that all its kernels are there.
 
-    That takes a second when they are in the cache, and about a minute on two cores at the first time after an
-    installation; then `say` is told, and a second process compiles beside this one. In a process that is warm, nothing
-    is done.
+    That takes a third of a second when they are in the cache, and about a minute on two cores at the first time after
+    an installation; then `say` is told, and a second process compiles beside this one. In a process that is warm,
+    nothing is done.
     """
     if device in _warm:
         return
