@@ -42,7 +42,8 @@ def kernel(function: Callable[..., object] | None = None, **options: Any) -> Any
     if function is None:
         return partial(kernel, **options)
     made = _njit(function, nogil=True, **_LESS, **options)
-    if kernel_cache.FOLDER is not None:
+    # With NUMBA_DISABLE_JIT it is the function itself.
+    if kernel_cache.FOLDER is not None and isinstance(made, Dispatcher):
         _keep(made)
     return made
 

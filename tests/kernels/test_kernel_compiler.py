@@ -150,6 +150,13 @@ def test_numba_of_a_version_that_was_not_tried_compiles_in_its_own_way(
     assert len(with_code) > 5  # wrappers of both loops, and all that they call
 
 
+def test_kernels_stay_functions_where_numba_is_told_to_compile_none() -> None:
+    program = "import numpy as np; from gsseg_core.csr_rows import CSRRows; print(*CSRRows.from_dense(np.eye(2)).indptr)"
+    environment = {**os.environ, "NUMBA_DISABLE_JIT": "1"}
+    done = subprocess.run([sys.executable, "-c", program], env=environment, capture_output=True, text=True, check=False)
+    assert done.stdout == "0 1 2\n", done.stderr
+
+
 @pytest.mark.parametrize(("told", "policy"), [({}, "PASSIVE"), ({"OMP_WAIT_POLICY": "active"}, "ACTIVE")])
 def test_threads_that_wait_for_others_sleep_unless_the_user_says_otherwise(told: dict[str, str], policy: str) -> None:
     program = (
