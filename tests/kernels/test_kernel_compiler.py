@@ -151,7 +151,9 @@ def test_numba_of_a_version_that_was_not_tried_compiles_in_its_own_way(
 
 
 def test_kernels_stay_functions_where_numba_is_told_to_compile_none() -> None:
-    program = "import numpy as np; from gsseg_core.csr_rows import CSRRows; print(*CSRRows.from_dense(np.eye(2)).indptr)"
+    program = (
+        "import numpy as np; from gsseg_core.csr_rows import CSRRows; print(*CSRRows.from_dense(np.eye(2)).indptr)"
+    )
     environment = {**os.environ, "NUMBA_DISABLE_JIT": "1"}
     done = subprocess.run([sys.executable, "-c", program], env=environment, capture_output=True, text=True, check=False)
     assert done.stdout == "0 1 2\n", done.stderr
