@@ -153,12 +153,12 @@ def examine_dataset(path: str, labels: str) -> list[Finding]:
 
     Raises what `Dataset` and `View.read_seen` raise.
     """
-    from gsseg_core.data.camera_formats.table import CAMERA_FORMATS
+    from gsseg_core.data.camera_files import find_cameras
     from gsseg_core.data.dataset import Dataset
     from gsseg_core.text import clipped, counted
 
-    known = next((known for known in CAMERA_FORMATS if os.path.isdir(path) and known.find(Path(path))), None)
-    if known is None:
+    found = find_cameras(Path(path)) if os.path.isdir(path) else None
+    if found is None:
         return []
     dataset, name = Dataset(path, labels), clipped(path)
     masked = [view for view in dataset.views() if view.has_mask]
@@ -168,7 +168,7 @@ def examine_dataset(path: str, labels: str) -> list[Finding]:
     mark, fix = ("ok", "") if masked else ("-", "gsseg segment takes their place by --labels PATH")
     told = f"of {counted(len(masked), 'view')}; all can be read" if masked else f"none in {clipped(labels)}"
     return [
-        Finding(name, "cameras", f"{known.name}: {train} to learn from, {test} to test"),
+        Finding(name, "cameras", f"{found[0].name}: {train} to learn from, {test} to test"),
         Finding(name, "masks", told, mark, fix),
         Finding(name, "scene", "not looked at", "", f"gsseg doctor {name} --scene SCENE tells whether cameras fit"),
     ]

@@ -29,8 +29,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(options: argparse.Namespace) -> int:
     """Score, and print a table."""
-    from gsseg_core.data.camera_files import read_cameras
-    from gsseg_core.data.camera_formats.table import CAMERA_FORMATS
+    from gsseg_core.data.camera_files import find_cameras, read_cameras
     from gsseg_core.data.class_names import read_classes
     from gsseg_core.data.mask_formats.table import open_masks
     from gsseg_core.errors import ClassesFileError, SettingsError
@@ -46,7 +45,7 @@ def run(options: argparse.Namespace) -> int:
     root = Path(options.truth).parent
     classes = root / "classes.json"
     names = read_classes(classes) if is_there(classes, ClassesFileError) else None
-    cameras = read_cameras(root) if any(known.find(root) for known in CAMERA_FORMATS) else []
+    cameras = read_cameras(root) if find_cameras(root) else []
     images = [camera.image for camera in cameras] or [path.stem for path in predicted_maps(options.pred)]
     masks = open_masks(Path(options.truth), images)
     if masks is None:

@@ -30,7 +30,7 @@ def read_cameras(folder: str | os.PathLike[str], within: Path | None = None) -> 
     lies outside `within`.
     """
     folder = Path(folder)
-    found = _find(folder)
+    found = find_cameras(folder)
     if found is None:
         hint = camera_hint(folder) if within is None else ""  # It looks around, wherever links lead.
         what = "has no cameras" if folder.is_dir() else "is not a folder"
@@ -66,14 +66,14 @@ def frame_of_training(folder: Path, dataparser: Path) -> Similarity | None:
     `dataparser` is the `dataparser_transforms.json` beside the trained config. None if the cameras are of a format that
     nerfstudio does not train from; raises `CameraFileError` or `PoseError` where a file is missing or broken.
     """
-    found = _find(folder)
+    found = find_cameras(folder)
     if found is None or found[0].frame_of_training is None:
         return None
     return found[0].frame_of_training(found[1], dataparser)
 
 
-def _find(folder: Path) -> tuple[CameraFormat, Path] | None:
-    """Find the cameras of a dataset folder, and of which format they are."""
+def find_cameras(folder: Path) -> tuple[CameraFormat, Path] | None:
+    """Find the cameras of a dataset folder, and of which format they are; None where it has none."""
     for camera_format in CAMERA_FORMATS:
         if path := camera_format.find(folder):
             return camera_format, path

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import itertools
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from typing import NamedTuple
 
@@ -69,7 +70,7 @@ def merge_states(saved: Sequence[Saved]) -> State:  # at least one
                 )
         votes[:, : one.state.votes.shape[1]] += one.state.votes
         for view in one.state.views:
-            name = _free_name(view.name, views)
+            name = next(free for free in _names(view.name) if free not in views)
             views[name] = view if name == view.name else replace(view, camera=replace(view.camera, name=name))
     num_fused = sum(one.state.num_fused for one in saved)
     class_names = dict(sorted(names.items()))
@@ -79,12 +80,10 @@ def merge_states(saved: Sequence[Saved]) -> State:  # at least one
     )
 
 
-def _free_name(name: str, taken: dict[str, View]) -> str:
-    free, count = name, 1
-    while free in taken:
-        count += 1
-        free = f"{name}_{count}"
-    return free
+def _names(name: str) -> Iterator[str]:
+    """Give the names that views of one name get, one after the other."""
+    yield name
+    yield from (f"{name}_{count}" for count in itertools.count(2))
 
 
 def _is_same_map(one: LivingScene | None, other: LivingScene | None) -> bool:
@@ -109,13 +108,7 @@ def _brings_nothing(one: State, other: State) -> bool:
 
 def _is_among(view: View, known: dict[str, View]) -> bool:
     """Whether a view is there, under its name or one that merging gave it."""
-    name, count = view.name, 1
-    while name in known:
-        if _is_same_view(view, known[name]):
-            return True
-        count += 1
-        name = f"{view.name}_{count}"
-    return False
+    return any(_is_same_view(view, known[name]) for name in itertools.takewhile(known.__contains__, _names(view.name)))
 
 
 def _is_same_view(one: View, other: View) -> bool:

@@ -139,20 +139,23 @@ class ViewRenderer(ABC):
     def _rows(self, codes: CSRRows, num_classes: int, of: np.ndarray | None) -> np.ndarray:
         """Check sparse codes, and tell which of their rows each of `ids` has, (M,) int32."""
         self._check_rows(len(codes.indptr) - 1, of)
-        rows = self.ids
-        if of is not None:
-            place = np.full(self.num_gaussians, -1, np.int32)
-            place[of] = np.arange(len(of), dtype=np.int32)
-            rows = place[rows]
-        self._check_codes(codes.indices, num_classes, rows)
-        return rows
+        self._check_classes(codes.indices, num_classes)
+        if of is None:
+            return self.ids
+        place = np.full(self.num_gaussians, -1, np.int32)
+        place[of] = np.arange(len(of), dtype=np.int32)
+        return self._all_there(place[self.ids])
 
-    def _check_codes(self, indices: Any, num_classes: int, rows: Any) -> None:  # (Z,), (M,) of NumPy or PyTorch
-        """Refuse sparse codes of too many classes, or of which some of `ids` have no row, -1."""
+    def _check_classes(self, indices: Any, num_classes: int) -> None:  # (Z,) of NumPy or PyTorch
+        """Refuse sparse codes of too many classes."""
         if len(indices) and (most := int(indices.max())) >= num_classes:
             raise SceneValueError(f"view {self.camera.name!r}: codes are of class {most}; expected below {num_classes}")
+
+    def _all_there(self, rows: Any) -> Any:  # (M,) of NumPy or PyTorch
+        """Return the rows of codes that `ids` have; refuse codes of which some have none, -1."""
         if len(rows) and int(rows.min()) < 0:
             raise SceneValueError(f"view {self.camera.name!r}: a Gaussian that it shows has no codes; expected all")
+        return rows
 
     def _check_rows(
         self, count: int, of: Sized | None, wanted: np.ndarray | None = None, what: str = "codes"

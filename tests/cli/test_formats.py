@@ -67,7 +67,7 @@ def test_a_scene_format_is_one_line_in_the_table(
         GaussianScene.load(tmp_path / "room.txt")
     with pytest.raises(SceneFileError, match=r"found room.toy in"):
         GaussianScene.load(tmp_path / "rooom.toy")
-    with pytest.raises(SceneFileError, match=r"is a folder.*; type .*room.toy"):
+    with pytest.raises(SceneFileError, match=r"cannot be read \(is a folder\); expected .*; type .*room.toy"):
         GaussianScene.load(tmp_path)
     main(["doctor"])
     assert "toys" in (told := doctor.readouterr().out) and ".toy" in told

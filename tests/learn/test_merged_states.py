@@ -91,7 +91,7 @@ def test_a_state_that_is_given_twice_or_is_known_already_is_refused_and_a_later_
     again = robot(tmp_path / "again.npz", VIEWS[:2])
     for same in (one, again):
         assert main(["merge", one, later, same, "-o", str(out)]) == 2
-        assert f"{same}: {one} has all its votes and views already, which" in capsys.readouterr().err
+        assert f"{same}: {one} has all its votes and views already, which would count twice" in capsys.readouterr().err
     session = load(one)
     with pytest.raises(StateFileError, match=r"again\.npz: what is known here has all its votes and views already"):
         session.merge([later, again])

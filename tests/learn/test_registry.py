@@ -61,9 +61,15 @@ def test_the_learner_that_contributing_adds_learns_from_views() -> None:
     assert (sharp.codes_.max(axis=1) >= votes.codes_.max(axis=1) - 1e-6).all()
 
 
-@pytest.mark.parametrize("name", ["em", "gradient"])
-def test_no_steps_at_all_are_refused_and_not_taken_for_as_many_as_usual(name: str) -> None:
-    with pytest.raises(SettingsError, match=r"is 0.* expected (at least one|a whole number, 1)"):
+@pytest.mark.parametrize(
+    ("name", "said"),
+    [
+        ("em", "max_steps is 0; expected a whole number, 1 or more"),
+        ("gradient", "epochs is 0, rate 0.05, final_rate 0.005; expected at least one epoch"),
+    ],
+)
+def test_no_steps_at_all_are_refused_and_not_taken_for_as_many_as_usual(name: str, said: str) -> None:
+    with pytest.raises(SettingsError, match=said):
         make_learner(name, SCENE, NUM_CLASSES, max_steps=0)
 
 

@@ -68,6 +68,8 @@ def test_tf_poses_are_looked_up_at_the_stamp_and_never_the_latest() -> None:
         for stamp, frame in ((3 * S, "camera"), (0, "camera"), (1 * S, ""), (1 * S, "no_such_frame")):
             assert poses.at(stamp, frame) is None
             assert poses.problem
+        poses.set_back(2 * S, 0)
+        assert poses.at(1500 * MS, "camera") is None
         poses.close()
     finally:
         node.destroy_node()

@@ -79,7 +79,7 @@ def tf_fixture(monkeypatch: pytest.MonkeyPatch) -> tuple[TfPoses, Any]:
 
 def transform(stamp: int, x: float, child: str) -> TransformStamped:
     message = TransformStamped(child_frame_id=child)
-    message.header.stamp, message.transform.translation.x = stamp_message(stamp), x
+    message.header.stamp, message.transform.translation.x = stamp_message(stamp), float(x)
     return message
 
 
@@ -133,6 +133,7 @@ def test_a_frame_that_begins_late_in_a_round_is_not_taken_for_one_of_before(tf: 
     for stamp in (1 * S, 20 * S):
         listener.set_transform(transform(stamp, 1.0, "base"), "")
     transforms.set_back(20 * S, 1 * S)
+    assert transforms.look_up("base", 20 * S) is None
     for stamp, child in ((1 * S, "base"), (15 * S, "base"), (15 * S, "arm")):
         listener.set_transform(transform(stamp, 2.0, child), "")
     assert transforms.look_up("arm", 15 * S) is not None

@@ -18,7 +18,7 @@ from gsseg_core.learn.em.gpu_edges import edges_along as edges_along
 from gsseg_core.learn.learner import UNITS
 from gsseg_core.raster.gpu.device import called_by_kernels, cuda, find_gpu, gpu_kernel, launch, on_device, to_cpu
 from gsseg_core.raster.gpu.gpu_observation import GPUObservation, ShareTensors
-from gsseg_core.raster.gpu.label_sharing import halves, in_px
+from gsseg_core.raster.gpu.label_sharing import halves, joined
 from gsseg_core.raster.gpu.tensors import PairTensors, RowTensors, starts
 from gsseg_core.raster.observation import Observation
 
@@ -169,7 +169,7 @@ def _counters(num_classes: int, num_labels: int, device: torch.device) -> torch.
 
 
 def _in_px(counts: torch.Tensor) -> np.ndarray:  # (C, K, L)
-    return in_px(halves(counts).sum(dim=0))
+    return joined(halves(counts).sum(dim=0)) / _PX
 
 
 @gpu_kernel

@@ -177,7 +177,7 @@ class GPUObservation(Observation):
 
 def _px_by_label(units: torch.Tensor, labels: torch.Tensor, count: int) -> np.ndarray:  # (S,) int64, (S,)
     """Add up units by label, in px, (L,) float64."""
-    return kernels.in_px(units.new_zeros((count, 2)).index_add_(0, labels, kernels.halves(units)))
+    return kernels.joined(units.new_zeros((count, 2)).index_add_(0, labels, kernels.halves(units))) / kernels.UNITS
 
 
 def _cut(mask: torch.Tensor, tiles: TileTensors) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:

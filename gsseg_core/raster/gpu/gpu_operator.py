@@ -98,13 +98,13 @@ class GPUOperator(ViewOperator):
         """Write codes of `ids` out by class on the GPU, (M, K); `of` as in `blend_rows`. Both may be there already."""
         self._check_rows(len(codes.indptr) - 1, of, wanted)
         rows = RowTensors.kept(codes, self._device) if isinstance(codes, CSRRows) else codes
+        self._check_classes(rows.indices, num_classes)
         ids = self.tiles.ids.long()
         if of is not None:
             of = on_device(of, self._device) if isinstance(of, np.ndarray) else of
             place = torch.full((self.num_gaussians,), -1, dtype=torch.int64, device=self._device)
             place[of.long()] = torch.arange(len(of), device=self._device)
-            ids = place[ids]
-        self._check_codes(rows.indices, num_classes, ids)
+            ids = self._all_there(place[ids])
         return rows.dense(ids, num_classes)
 
     def blend_there(self, codes: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:  # (M, K)

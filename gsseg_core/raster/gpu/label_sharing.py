@@ -45,10 +45,10 @@ def halves(units: torch.Tensor) -> torch.Tensor:  # int64 of at least 0
     return torch.stack([units >> 32, units & 0xFFFFFFFF], dim=-1)
 
 
-def in_px(sums: torch.Tensor) -> np.ndarray:  # (..., 2) int64
-    """Put sums of halves together, in px, float64."""
+def joined(sums: torch.Tensor) -> np.ndarray:  # (..., 2) int64
+    """Put sums of halves together, in units, float64."""
     high, low = np.moveaxis(to_cpu(sums), -1, 0)
-    return np.asarray((high * 2.0**32 + low) / UNITS)
+    return np.asarray(high * 2.0**32 + low)
 
 
 @gpu_kernel
