@@ -28,6 +28,10 @@ WORK = {
     "segment": """
 from gsseg_core.cli.main import main
 assert main(["segment", {scene!r}, "--data", {data!r}, "--out", {out!r}, "--quiet"]) == 0""",
+    "find objects": """
+from gsseg_core.cli.main import main
+run = ["segment", {scene!r}, "--data", {data!r}, "--out", {out!r}, "--ids", "per-view", "--quiet"]
+assert main(run) == 0""",
     "fuse": """
 from gsseg_core.data.dataset import Dataset
 from gsseg_core.live.session import LiveSession
@@ -144,6 +148,11 @@ def test_warm_up_says_nothing_where_the_kernels_are_there() -> None:
     program = "from gsseg_core.warm_up import warm_up; warm_up(say=print)"
     told = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True).stdout
     assert told == ""
+
+
+def test_warm_up_loads_no_scipy() -> None:
+    program = "import sys; from gsseg_core.warm_up import warm_up; warm_up(); sys.exit('scipy.sparse' in sys.modules)"
+    subprocess.run([sys.executable, "-c", program], check=True)
 
 
 @pytest.mark.parametrize("what", WORK)

@@ -21,7 +21,7 @@ from gsseg_core.scene.scene_writers import DEFAULT, SCENE_WRITERS, SceneObject, 
 from gsseg_core.scene.triangle_mesh import LONE, TriangleMesh
 from gsseg_core.scene.vertices import chosen
 from gsseg_core.segmentation import Segmentation
-from gsseg_core.spatial.row_order import take_rows_into
+from gsseg_core.spatial.row_order import rows_by_label, take_rows_into
 
 TOGETHER = "objects"  # stem of the file in which a format keeps the objects of all classes
 _PART = 1 << 15  # vertices that are copied and written at a time
@@ -92,7 +92,7 @@ def write_classes(
     """
     confidence, names = segmentation.confidence, segmentation.class_names
     order = np.arange(len(scene)) if order is None else order
-    members = {k: order[ids] for k, ids in _members(segmentation.labels[order]).items()}
+    members = {k: order[ids] for k, ids in rows_by_label(segmentation.labels[order]).items() if k >= 0}
     paths = class_paths(segmentation, folder, scene_format)
     for k, mesh in meshes.items():
         mesh.save(folder / mesh_file_name(k, names[k]), run)
@@ -136,7 +136,8 @@ def write_selection(
             _remove_mesh(places[k])
         return
     labels = labels[chosen]
-    objects = _objects(part, _members(labels), class_names, meshes)
+    members = {k: ids for k, ids in rows_by_label(labels).items() if k >= 0}
+    objects = _objects(part, members, class_names, meshes)
     if (labels < 0).any():
         objects.append(SceneObject(part.subset(labels < 0)))
     write_objects(objects, path, scene_format)
@@ -150,11 +151,6 @@ def _remove_mesh(path: Path) -> None:
                 is_ours = file.readline(len(LONE)) == LONE
             if is_ours:
                 path.unlink()
-
-
-def _members(labels: np.ndarray) -> dict[int, np.ndarray]:  # (N,) int
-    """List the Gaussians of each class that has any, (M,) int64."""
-    return {k: np.flatnonzero(labels == k) for k in np.unique(labels[labels >= 0]).tolist()}
 
 
 def _objects(

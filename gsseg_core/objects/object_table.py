@@ -205,9 +205,9 @@ class ObjectTable:
     def with_tree(self, segmentation: Segmentation) -> Segmentation:
         """Add parts and wholes to a segmentation of the scene whose classes are these objects, by the views kept."""
         segmentation.require(self.scene)
-        labels, probabilities = segmentation.labels, segmentation.probabilities
-        # What refinement took out covers an object still.
-        classes = np.where(labels == REMOVED, probabilities.argmax(axis=1), labels)
+        classes, probabilities = segmentation.labels.copy(), segmentation.probabilities
+        removed = classes == REMOVED  # It covers an object still.
+        classes[removed] = probabilities[removed].argmax(axis=1)
         level = _EARLY_GRANULARITY if self._agreement is None else self._agreement
         tree = grow_tree(self.scene.means, classes, probabilities.shape[1], self._lifted, level, self.settings)
         return replace(segmentation, tree=tree)

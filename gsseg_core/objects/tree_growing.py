@@ -22,13 +22,16 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
+from functools import cached_property
 
 import numpy as np
 from scipy import sparse
 
 from gsseg_core.data.object_tree import ObjectTree
 from gsseg_core.objects.association import AssociationSettings
+from gsseg_core.objects.column_products import column_products
 from gsseg_core.objects.lifted_segments import Lifted, sums
+from gsseg_core.spatial.row_order import rows_by_label
 
 SEVERAL = 3  # views that have to show a part or a whole
 _CELL, _MOST_CELLS = 8, 256  # Gaussians of a cell; cells of an object, of which a larger one has larger cells
@@ -66,7 +69,8 @@ def grow_tree(
     segments = _Segments.of(views, len(means), settings or AssociationSettings())
     objects = [_Region(row=k) for k in range(num_classes)]
     places = np.where(classes >= 0, 0, -1)  # among the leaves of its object
-    members = [np.flatnonzero(classes == k) for k in range(num_classes)]
+    of_class, nobody = rows_by_label(classes), np.zeros(0, np.int64)
+    members = [of_class.get(k, nobody) for k in range(num_classes)]
     for k in range(1, num_classes):
         rows, own = segments.on(members[k])
         regions, shares = _regions(means[members[k]], rows, own)
@@ -76,9 +80,10 @@ def grow_tree(
             places[members[k]] = _nearest_part(means[members[k]], rows, own, shares[[r.row for r in found.leaves()]])
             objects[k] = found
     for k, object_ in enumerate(objects):
-        for place, leaf in enumerate(object_.leaves()):
-            leaf.size = int(np.count_nonzero(places[members[k]] == place))
-    return _numbered(objects, _wholes(objects, members, segments, level), classes, places, level)
+        leaves = object_.leaves()
+        for leaf, size in zip(leaves, np.bincount(places[members[k]], minlength=len(leaves)).tolist(), strict=True):
+            leaf.size = size
+    return _numbered(objects, _wholes(objects, members, segments, level), members, places, level)
 
 
 @dataclass(frozen=True, eq=False)
@@ -112,7 +117,7 @@ class _Segments:
         """Sum up what each view sees of regions (R, S), in px, (R, views)."""
         return np.add.reduceat(regions, self._firsts, axis=1) if len(self.view) else regions
 
-    @property
+    @cached_property
     def _firsts(self) -> np.ndarray:
         return np.flatnonzero(np.diff(self.view, prepend=-1))
 
@@ -130,7 +135,10 @@ class _Segments:
         if not len(self.view):
             return np.zeros((len(regions), 0), bool)
         seen = self.seen(shares)
-        overlap = shares / np.maximum(seen[:, self.view] + self.size - shares, 1e-9)
+        overlap = seen[:, self.view]
+        overlap += self.size
+        overlap -= shares
+        np.divide(shares, np.maximum(overlap, 1e-9, out=overlap), out=overlap)
         fits = overlap > _ITSELF
         for region in regions:
             for part in region.parts:
@@ -176,22 +184,24 @@ def _merge(shares: np.ndarray, segments: _Segments) -> tuple[list[_Region], np.n
     votes, counts = (columns.T.copy() for columns in segments.votes(shares))  # (S, R) and (views, R)
 
     def agreement(rows: np.ndarray) -> np.ndarray:
-        # As sparse products, they have the same bits whatever number of threads there is.
-        both = sparse.csr_matrix(counts[:, rows].T) @ counts
-        agreed: np.ndarray = sparse.csr_matrix(votes[:, rows].T) @ votes / (both + settings.doubt)
+        both = column_products(counts, rows)
+        agreed: np.ndarray = column_products(votes, rows) / (both + settings.doubt)
         agreed[both < settings.evidence] = 0
         agreed[np.arange(len(rows)), rows] = 0
         return agreed
 
-    agreed = agreement(at)
+    agreed, left = agreement(at), np.ones(len(at), bool)
     while len(at):
-        best = agreed.argmax(axis=1)
-        first = np.flatnonzero(
-            (best[best] == np.arange(len(at))) & (best > np.arange(len(at))) & (agreed.max(axis=1) > 0)
-        )
+        if 2 * np.count_nonzero(left) < len(left):  # What has merged into others costs nothing any more.
+            at, shares, agreed = at[left], shares[left], agreed[np.ix_(left, left)]
+            votes, counts = votes.compress(left, axis=1), counts.compress(left, axis=1)
+            left = np.ones(len(at), bool)
+        places, best = np.arange(len(at)), agreed.argmax(axis=1)
+        first = np.flatnonzero((best[best] == places) & (best > places) & (agreed[places, best] > 0))
         if not len(first):
             break
         second = best[first]
+        left[second] = False
         for a, b, by in zip(at[first], at[second], agreed[first, second].tolist(), strict=True):
             regions.append(_Region(by, [regions[a], regions[b]], len(regions)))
         at[first] = np.arange(len(regions) - len(first), len(regions))
@@ -270,7 +280,11 @@ def _wholes(
 
 
 def _numbered(
-    objects: Sequence[_Region], wholes: Sequence[_Region], classes: np.ndarray, places: np.ndarray, level: float
+    objects: Sequence[_Region],
+    wholes: Sequence[_Region],
+    members: Sequence[np.ndarray],
+    places: np.ndarray,
+    level: float,
 ) -> ObjectTree:
     """Give the nodes numbers, those with the most Gaussians first, and every Gaussian that of its leaf."""
     parents, agreement = [-1] * len(objects), [1.0] * len(objects)
@@ -283,13 +297,11 @@ def _numbered(
         for place, part in enumerate(region.parts):
             add(part, first + place)
 
-    leaves = np.where(classes >= 0, classes, -1).astype(np.int32)
+    leaves = np.full(len(places), -1, np.int32)
     for k, region in enumerate(objects):
         before = region.leaves()
         add(_pruned(region), k)
-        if region.parts:
-            mine = classes == k
-            leaves[mine] = np.array([leaf.number for leaf in before])[places[mine]]
+        leaves[members[k]] = np.array([leaf.number for leaf in before])[places[members[k]]] if region.parts else k
 
     def put_together(region: _Region, whole: int) -> None:
         if region.parts:

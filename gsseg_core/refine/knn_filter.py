@@ -10,8 +10,9 @@ import numpy as np
 
 from gsseg_core.csr_rows import CSRRows, largest
 from gsseg_core.refine.settings import RefineSettings
-from gsseg_core.spatial.class_distances import class_distances, members_of_classes
+from gsseg_core.spatial.class_distances import class_distances
 from gsseg_core.spatial.neighbourhood import Neighbours, neighbour_weights
+from gsseg_core.spatial.row_order import rows_by_label
 
 
 def cluster_in_place(
@@ -78,8 +79,8 @@ def statistical_filter(
     if len(means) < 3:
         return removed
     known = class_distances(neighbours or Neighbours.among(means, k), labels, limit)
-    for members in members_of_classes(labels, limit):
-        if members.size < 3:
+    for label, members in rows_by_label(labels).items():
+        if not 0 < label < limit or members.size < 3:
             continue
         distances = known[members]
         in_order = np.sort(distances)  # rounding in the mean must not depend on the order of the Gaussians

@@ -7,9 +7,6 @@ only those are found anew that lie near them, and results are the same bits as o
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from itertools import pairwise
-
 import numba as nb
 import numpy as np
 
@@ -18,6 +15,7 @@ from gsseg_core.simd import at_most, load_row
 from gsseg_core.spatial import knn
 from gsseg_core.spatial.kd_tree import LEAF, Tree, leaf_range
 from gsseg_core.spatial.neighbourhood import Found, Neighbours, nodes_without
+from gsseg_core.spatial.row_order import rows_by_label
 
 MIXED = np.int32(-(2**31))  # stands for the label of a node whose points have several
 NOBODY = MIXED + 1  # the label of no point
@@ -39,25 +37,16 @@ def class_distances(neighbours: Neighbours, labels: np.ndarray, num_classes: int
     radii[of_point == 0], found[of_point == 0] = np.nan, np.nan
     pure = pure_distances(tree, of_point, wanted, neighbours.radii, neighbours.distances)
     found[wanted], radii[wanted] = pure[wanted], neighbours.radii[wanted]
-    for members in members_of_classes(of_point, num_classes):
+    for label, members in rows_by_label(of_point).items():
         mixed = np.flatnonzero(wanted[members] & np.isnan(found[members])).astype(np.int32)
         # Where other classes are among the neighbours, more of its own are looked for, farther away.
-        if len(members) > 1 and len(mixed):
+        if label and len(members) > 1 and len(mixed):
             places, nearest = members[mixed], min(k, len(members) - 1)
             radii[places], found[places] = knn.nearest(tree.part(members), mixed, nearest, False)[:2]
     neighbours.by_class = Found(of_point, radii, found)
     out = np.empty(len(labels))
     out[tree.order] = found
     return out
-
-
-def members_of_classes(labels: np.ndarray, num_classes: int) -> Iterator[np.ndarray]:  # (N,) int
-    """List the members of each class, ascending, from class 1 on; labels outside 0 to `num_classes` - 1 may occur."""
-    # Short numbers are sorted by their digits, in a quarter of the time.
-    short = np.clip(labels, -1, num_classes).astype(np.int16) if num_classes < 2**15 else labels
-    order = np.argsort(short, kind="stable")
-    bounds = np.searchsorted(short, np.arange(1, num_classes + 1), sorter=order).tolist()
-    return (order[first:last] for first, last in pairwise(bounds))
 
 
 def _to_be_found(tree: Tree, labels: np.ndarray, before: Found, k: int) -> np.ndarray:

@@ -8,8 +8,11 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 from parts_of_balls import SCENE, TOP, TRUTH, halved, seen_as, views_in_halves
 from per_view_ids import shuffled
+from scipy import sparse
 from small_scenes import NAMES, NUM_CLASSES, balls_on_a_table, clean_views, ring, write_dataset
 
 from gsseg_core.cli.main import main
@@ -22,7 +25,7 @@ from gsseg_core.learn.vote_learner import VoteLearner
 from gsseg_core.objects.association import AssociationSettings
 from gsseg_core.objects.lifted_segments import Lifted
 from gsseg_core.objects.object_table import ObjectTable, find_objects, object_name
-from gsseg_core.objects.tree_growing import grow_tree
+from gsseg_core.objects.tree_growing import _merge, _Segments, grow_tree
 from gsseg_core.raster.backends import make_operator
 from gsseg_core.refine.settings import UNREFINED
 from gsseg_core.scene.gaussian_scene import GaussianScene
@@ -34,6 +37,47 @@ VIEWS = clean_views(12)
 def grown(views: Sequence[View], level: float = 0.4) -> ObjectTree:
     lifted = {v.name: Lifted.of(make_operator(SCENE, v.camera).observe(v.read_labels())) for v in views}
     return grow_tree(SCENE.means, TRUTH, NUM_CLASSES, lifted, level)
+
+
+def merged_slowly(shares: np.ndarray, segments: _Segments) -> tuple[list[tuple[int, int, float]], np.ndarray]:
+    """Regions that merge, and how much they agree, and the shares of all: every round measures every pair anew."""
+    settings, left, every, merges = (
+        segments.settings,
+        list(range(len(shares))),
+        [*shares],
+        list[tuple[int, int, float]](),
+    )
+    while True:
+        votes, counts = segments.votes(np.array([every[region] for region in left]))
+        both = sparse.csr_matrix(counts) @ counts.T
+        agreed = sparse.csr_matrix(votes) @ votes.T / (both + settings.doubt)
+        agreed[both < settings.evidence] = 0
+        np.fill_diagonal(agreed, 0)
+        best = agreed.argmax(axis=1).tolist()
+        pairs = [(a, b) for a, b in enumerate(best) if b > a and best[b] == a and agreed[a, b] > 0]
+        if not pairs:
+            return merges, np.array(every)
+        for a, b in pairs:
+            merges.append((left[a], left[b], float(agreed[a, b])))
+            every.append(every[left[a]] + every[left[b]])
+            left[a] = len(every) - 1
+        gone = {b for _, b in pairs}
+        left = [region for place, region in enumerate(left) if place not in gone]
+
+
+@given(st.integers(1, 40), st.integers(1, 6), st.integers(1, 12), st.integers(0, 2**32 - 1))
+def test_regions_merge_bit_for_bit_as_when_all_pairs_are_measured_in_every_round(
+    count: int, views: int, ids: int, seed: int
+) -> None:
+    rng = np.random.default_rng(seed)
+    view = np.repeat(np.arange(views), ids)
+    shares = rng.integers(0, 60, (count, len(view))) * (rng.random((count, len(view))) < 2 / ids) * 1.0
+    settings = AssociationSettings()
+    segments = _Segments(sparse.csr_matrix(shares), view, shares.sum(axis=0), settings)
+    regions, found = _merge(shares, segments)
+    merges, expected = merged_slowly(shares, segments)
+    assert [(*(part.row for part in r.parts), r.agreement) for r in regions[count:]] == merges
+    np.testing.assert_array_equal(found, expected)
 
 
 def test_an_object_that_some_views_cut_up_has_parts() -> None:

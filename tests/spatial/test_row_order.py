@@ -10,7 +10,7 @@ from numpy.lib import recfunctions
 from small_scenes import balls_on_a_table
 
 from gsseg_core.scene.gaussian_scene import GaussianScene
-from gsseg_core.spatial.row_order import curve_order, reordered, take_rows
+from gsseg_core.spatial.row_order import curve_order, reordered, rows_by_label, take_rows
 
 
 def cell_number(x: int, y: int, z: int) -> int:
@@ -67,3 +67,13 @@ def test_rows_are_copied_as_numpy_does(width: int, count: int, seed: int) -> Non
     table = random.normal(size=(50, width)).astype(np.float32)
     chosen = random.integers(0, 50, count)
     np.testing.assert_array_equal(take_rows(table, chosen), table[chosen])
+
+
+@pytest.mark.parametrize("dtype", [np.int16, np.int32, np.int64])
+@given(st.lists(st.sampled_from([-(2**15), -2, -1, 0, 1, 7, 2**15 - 1, 2**15, 2**31 - 1]), max_size=40))
+def test_rows_of_each_label_are_those_that_have_it(dtype: type, values: list[int]) -> None:
+    labels = np.array([value for value in values if value <= np.iinfo(dtype).max], dtype)
+    found = rows_by_label(labels)
+    assert list(found) == np.unique(labels).tolist()
+    for label, rows in found.items():
+        np.testing.assert_array_equal(rows, np.flatnonzero(labels == label))
