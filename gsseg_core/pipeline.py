@@ -161,6 +161,7 @@ def segment(
                 asked |= {check.name for check in shown_views(assessment.checks or ())}
                 look = partial(look_and_draw, inputs.scene, result, asked, drawn, device)
                 result = result.carved_by(inputs.scene, inputs.looked_at, look, device)
+                del look  # It holds probabilities that are no longer needed once they are calibrated.
         with watch.stage("pictures"):
             left = [view for view in inputs.pictured if view.name not in drawn]
             drawn |= {one.view.name: one for one in draw_views(inputs.scene, result, left, device=device)}

@@ -24,6 +24,8 @@ from gsseg_core.text import quoted
 PART, OBJECT, WHOLE = "part", "object", "whole"
 """What a node can be."""
 
+_ROWS = 1 << 10  # whose probabilities lie in the cache while column after column is added up
+
 
 @dataclass(frozen=True, eq=False)
 class ObjectTree:
@@ -177,15 +179,17 @@ class ObjectTree:
         column[nodes] = np.arange(len(nodes))
         usual = column[table[self._largest_leaf]]
         out = np.zeros((len(shares), len(nodes)), np.float32)
-        for k, to in enumerate(usual.tolist()):
-            out[:, to] += shares[:, k]
+        for first in range(0, len(shares), _ROWS):
+            some, into = shares[first : first + _ROWS], out[first : first + _ROWS]
+            for k, to in enumerate(usual.tolist()):
+                into[:, to] += some[:, k]
         rows = np.flatnonzero(leaves >= 0)
         of_class, own = self._classes[leaves[rows]], column[table[leaves[rows]]]
         moved = own != usual[of_class]
         rows, of_class, own = rows[moved], of_class[moved], own[moved]
         out[rows, usual[of_class]] -= shares[rows, of_class]
         out[rows, own] += shares[rows, of_class]
-        return np.maximum(out, 0), nodes.tolist()
+        return np.maximum(out, 0, out=out), nodes.tolist()
 
     @cached_property
     def _leaf_nodes(self) -> np.ndarray:

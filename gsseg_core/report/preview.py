@@ -9,9 +9,12 @@ from typing import Any
 
 import numpy as np
 
+from gsseg_core.data.object_tree import ObjectTree
+from gsseg_core.learn.temperature import tempered
 from gsseg_core.scene.camera import Camera
 from gsseg_core.scene.gaussian_scene import GaussianScene
 from gsseg_core.segmentation import UNOBSERVED, Segmentation
+from gsseg_core.spatial.row_order import rows_by_label
 
 MOST_GAUSSIANS = 60_000  # of the preview; 20 bytes each, a third more as text
 FEWEST_OF_CLASS = 200  # Gaussians of a class that are kept before the class is thinned out
@@ -31,7 +34,8 @@ class Preview:
     """Gaussians to look at.
 
     Positions are within `low` to `high`, scales as logarithms within `log_scales`, quaternions w, x, y, z. Labels are
-    as in the segmentation, `first` where unobserved, and where removed `first` + 1 more than the most probable class.
+    as in the segmentation, or nodes of its tree; the number of all of these where unobserved; and where removed, that
+    number + 1 more than the most probable one.
     """
 
     records: np.ndarray  # (M,) RECORD
@@ -57,9 +61,9 @@ class Preview:
 
 
 def make_preview(
-    scene: GaussianScene, segmentation: Segmentation, most: int = MOST_GAUSSIANS, first: int | None = None
+    scene: GaussianScene, segmentation: Segmentation, most: int = MOST_GAUSSIANS, parts: bool = False
 ) -> Preview:
-    """Choose the Gaussians that show most of the scene, and quantise them; `first` is the number of classes by default.
+    """Choose the Gaussians that show most of the scene, and quantise them, labelled by class, or by part if asked for.
 
     `most` are drawn at random, large and opaque ones rather than small and faint ones, always the same. The less likely
     one was to be drawn, the more others it stands for, and the larger it is made, so that surfaces stay closed. A class
@@ -69,8 +73,13 @@ def make_preview(
     core = _core(scene.means)
     a, b, c = scene.scales.T.astype(np.float64)
     area = np.maximum(np.maximum(a * b, b * c), a * c)
-    picked, chance = _draw(np.sqrt(area) * scene.opacities, segmentation.labels, most)
-    labels = segmentation.labels[picked]
+    tree, labels, first = segmentation.tree if parts else None, segmentation.labels, segmentation.num_classes
+    if tree is not None:
+        labels, first = tree.labels_at(1.0, labels), len(tree)
+    picked, chance = _draw(np.sqrt(area) * scene.opacities, labels, most)
+    labels, probabilities, nodes = labels[picked], segmentation.probabilities[picked], segmentation.class_ids
+    if tree is not None:
+        probabilities, nodes = _of_parts(probabilities, segmentation.temperature, tree, picked)
     means, nearer = _contracted(scene.means[picked].astype(np.float64), core)
     low, high = (means.min(axis=0), means.max(axis=0)) if len(means) else core
     extent = max(float((high - low).max()), 1e-9)
@@ -78,8 +87,7 @@ def make_preview(
     # Gaussians thinner than a thousandth of a pixel of any screen look like those that are not.
     logs = np.log(np.clip(sizes, 1e-5 * extent, extent))
     log_scales = np.array([logs.min(), logs.max()] if len(logs) else [0.0, 1.0], np.float64)
-    covered = 1 + segmentation.class_ids[segmentation.probabilities[picked].argmax(axis=1)]
-    others = (segmentation.num_classes if first is None else first) + np.where(labels == UNOBSERVED, 0, covered)
+    others = first + np.where(labels == UNOBSERVED, 0, 1 + nodes[probabilities.argmax(axis=1)])
     records = np.zeros(len(picked), RECORD)
     records["position"] = _quantised(means, low, high, 65535)
     records["label"] = np.where(labels < 0, others, labels)
@@ -87,8 +95,19 @@ def make_preview(
     records["scale"] = _quantised(logs, log_scales[0], log_scales[1], 255)
     records["opacity"] = np.rint(255 * scene.opacities[picked])
     records["color"] = np.rint(255 * np.clip(scene.colors(ids=picked), 0, 1))
-    records["confidence"] = np.rint(255 * np.clip(segmentation.confidence[picked], 0, 1))
+    records["confidence"] = np.rint(255 * np.clip(probabilities.max(axis=1), 0, 1))
     return Preview(records, low, high, core, log_scales, len(scene) - len(picked))
+
+
+def _of_parts(
+    probabilities: np.ndarray, temperature: float, tree: ObjectTree, ids: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Turn probabilities (M, K) of Gaussians (M,) into those of the finest parts, (M, K'), and name their nodes, (K',).
+
+    They are those of `Segmentation.at`, which takes the memory of all N.
+    """
+    shares, nodes = tree.shares_at(1.0, tempered(probabilities, 1 / temperature), tree.leaves[ids])
+    return tempered(shares, temperature), np.array(nodes)
 
 
 def look_from(cameras: Iterable[Camera], preview: Preview) -> list[dict[str, Any]]:
@@ -157,8 +176,7 @@ def _draw(weights: np.ndarray, labels: np.ndarray, most: int) -> tuple[np.ndarra
     weights = np.maximum(weights, 1e-300)  # No key is infinite.
     keys = np.random.default_rng(0).exponential(size=len(weights)) / weights
     limits = np.zeros(len(weights))  # Who has a smaller key is drawn.
-    for label in np.flatnonzero(np.bincount(labels - labels.min())) + labels.min():
-        own = np.flatnonzero(labels == label)
+    for own in rows_by_label(labels).values():
         limits[own] = _limit(keys[own], FEWEST_OF_CLASS)
     first = keys < limits
     if first.sum() > most:

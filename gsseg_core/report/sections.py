@@ -80,7 +80,7 @@ def preview(run: PageInputs) -> Content:
     if tree is not None and len(tree.granularities) > 1:
         first, colors = len(tree), palette(len(tree))
         levels = [_level(tree, granularity) for granularity in tree.granularities]
-    shown = make_preview(scene, segmentation.at(1.0) if levels else segmentation, first=first)
+    shown = make_preview(scene, segmentation, parts=bool(levels))
     # The more classes a view shows, the better it is to begin with.
     ranked = sorted(
         run.checked.checks, key=lambda check: (-check.counts.any(axis=1).sum(), -np.nan_to_num(check.reliability))

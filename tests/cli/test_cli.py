@@ -6,7 +6,9 @@ import json
 import re
 import subprocess
 import sys
+import weakref
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -14,11 +16,14 @@ from PIL import Image
 from segmented_place import assert_one_line, segment
 from small_scenes import look_at, many_classes, write_dataset
 
+from gsseg_core import pipeline
 from gsseg_core.cli.arguments import build_parser
 from gsseg_core.cli.main import main
 from gsseg_core.data.label_images import read_mask, write_mask
+from gsseg_core.export.summary import RunReport
 from gsseg_core.refine.label_propagation import UNKNOWN_SHARE
 from gsseg_core.scene.gaussian_scene import GaussianScene
+from gsseg_core.segmentation import Segmentation
 
 
 def test_segment_writes_labels_objects_report_and_pictures(pristine: Path) -> None:
@@ -190,6 +195,26 @@ def test_the_command_runs_as_a_process_of_its_own(place: Path) -> None:
     run = subprocess.run([*command, *segment(place, scene="no.ply")], capture_output=True, text=True, check=False)
     assert run.returncode == 2 and run.stdout == ""
     assert_one_line(run.stderr, "no.ply")
+
+
+def test_what_was_before_carving_takes_no_memory_any_more_when_files_are_written(
+    place: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    before, write_run, carved_by = list[weakref.ref[Segmentation]](), pipeline.write_run, Segmentation.carved_by
+
+    def carve(result: Segmentation, *arguments: Any) -> Segmentation:
+        before.append(weakref.ref(result))
+        return carved_by(result, *arguments)
+
+    def write(*arguments: Any) -> RunReport:
+        (one,) = before
+        assert one() is None
+        return write_run(*arguments)
+
+    monkeypatch.setattr(Segmentation, "carved_by", carve)
+    monkeypatch.setattr(pipeline, "write_run", write)
+    pipeline.segment(place / "data/scene.ply", place / "data", place / "carved")
+    assert before
 
 
 def test_the_package_and_the_pipeline_load_neither_pytorch_nor_templates() -> None:

@@ -4,13 +4,17 @@ from __future__ import annotations
 
 import base64
 import json
+import tracemalloc
+from dataclasses import replace
 
 import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from parts_of_balls import tree_of_balls
 from small_scenes import NUM_CLASSES, balls_on_a_table, look_at
 
+from gsseg_core.data.object_tree import ObjectTree
 from gsseg_core.report.preview import RECORD, look_from, make_preview, up_of
 from gsseg_core.scene.gaussian_scene import GaussianScene
 from gsseg_core.segmentation import REMOVED, UNOBSERVED, Segmentation
@@ -62,6 +66,40 @@ def test_a_thinned_preview_keeps_small_classes_covers_as_much_and_is_always_the_
     low, high = preview.log_scales
     areas = np.exp(2 * (low + preview.records["scale"][:, 0] / 255 * (high - low)))
     np.testing.assert_allclose(np.bincount(preview.records["label"], areas)[1:] / 1e-4, [4900, 60, 40], rtol=0.1)
+
+
+def test_a_preview_by_part_is_that_of_the_finest_level() -> None:
+    rng = np.random.default_rng(0)
+    codes = rng.dirichlet(np.ones(NUM_CLASSES), len(SCENE)).astype(np.float32)
+    labels = TRUTH.copy()
+    labels[::50], labels[1::50] = UNOBSERVED, REMOVED
+    result = replace(result_of(labels), probabilities=codes, tree=tree_of_balls()).calibrated(0.6)
+    fine = result.at(1.0)
+    for most in (500, len(SCENE)):
+        found, expected = make_preview(SCENE, result, most, parts=True).records, make_preview(SCENE, fine, most).records
+        expected["label"][expected["label"] >= fine.num_classes] += len(tree_of_balls()) - fine.num_classes
+        np.testing.assert_array_equal(found, expected)
+
+
+def test_a_preview_by_part_takes_no_memory_for_the_parts_of_all_gaussians() -> None:
+    count, classes = 20_000, 200
+    scene = GaussianScene.from_arrays(
+        np.random.default_rng(0).uniform(-1, 1, (count, 3)), np.tile([1.0, 0, 0, 0], (count, 1)),
+        np.full((count, 3), 0.01), np.full(count, 0.9), np.zeros((count, 1, 3)),
+    )  # fmt: skip
+    labels, halves = np.arange(count, dtype=np.int32) % classes, np.arange(classes, 3 * classes)
+    parents = np.concatenate([np.full(classes, -1), (halves - classes) // 2]).astype(np.int32)
+    agreement = np.where(parents < 0, 0.7, 1).astype(np.float32)
+    leaves = (classes + 2 * labels + np.arange(count) // classes % 2).astype(np.int32)
+    codes, none = np.eye(classes, dtype=np.float32)[labels], np.zeros(count, bool)
+    names = {k: str(k) for k in range(classes)}
+    tree = ObjectTree(parents, agreement, leaves, classes, 0.5)
+    result = Segmentation(labels, codes, names, scene.digest, none, codes[none], 0.6, tree=tree)
+    tracemalloc.start()
+    preview = make_preview(scene, result, 500, parts=True)
+    peak = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    assert len(preview.records) == 500 and peak < codes.nbytes
 
 
 def test_a_thinned_preview_makes_small_gaussians_larger_and_leaves_large_ones_as_they_are() -> None:
