@@ -17,7 +17,7 @@ BACKGROUND = (58, 60, 66)  # colour of label 0, a dark neutral grey
 PAPER, INK, FAINT_INK = (255, 255, 255), (32, 34, 38), (128, 131, 138)
 FILL = 0.55  # share of a label's colour in an overlaid pixel
 CELL_PX = 480  # longest side of the pictures of a contact sheet, which is looked at as a whole
-LEGEND_ROWS = 24  # lines in a column of a legend, at most
+LEGEND_ROWS = 24  # lines in a column of a legend, at most, unless it would become wider than high
 _LONGEST = 400  # characters of a name that are drawn at most; no picture is wide enough for more
 
 
@@ -134,7 +134,8 @@ def legend(class_names: Mapping[int, str], colors: np.ndarray, counts: np.ndarra
         max((font.getlength(entry[i]) for entry in entries), default=0) for i in range(3)
     )
     column = round(30 + id_width + 12 + name_width + 24 + count_width)
-    columns = max(1, -(-len(entries) // LEGEND_ROWS))
+    square = round((len(entries) * (column + 2 * margin) / line) ** 0.5)
+    columns = max(1, -(-len(entries) // max(LEGEND_ROWS, square)))
     rows = max(1, -(-len(entries) // columns))
     sheet = Image.new("RGB", (columns * (column + 2 * margin), rows * line + 2 * margin), PAPER)
     draw = ImageDraw.Draw(sheet)

@@ -6,7 +6,7 @@ for (const field of document.querySelectorAll(".search")) {
   field.addEventListener("input", () => {
     const wanted = field.value.trim().toLowerCase();
     for (const row of document.querySelectorAll(field.dataset.rows)) {
-      row.hidden = !row.querySelector("bdi").textContent.toLowerCase().includes(wanted);
+      row.hidden = ![...row.querySelectorAll("bdi")].some((name) => name.textContent.toLowerCase().includes(wanted));
     }
     const found = document.querySelectorAll(`${field.dataset.rows}:not([hidden], .elsewhere)`).length;
     field.nextElementSibling.textContent = wanted && `${found} found`;
@@ -226,9 +226,10 @@ for (const field of document.querySelectorAll(".search")) {
     const { name, shown } = level();
     document.querySelector(".level-name").textContent = name;
     levelSlider.setAttribute("aria-valuetext", name);
+    const there = new Set(shown);
     for (const box of boxes) {
       const label = Number(box.dataset.label);
-      box.closest("li").classList.toggle("elsewhere", label < unobserved && !shown.includes(label));
+      box.closest("li").classList.toggle("elsewhere", label < unobserved && !there.has(label));
     }
     legend.classList.toggle("many", inColumns && name === "objects");  // Names of parts are long.
     document.querySelector("#preview .search").dispatchEvent(new Event("input"));  // It says how many it finds.

@@ -131,6 +131,12 @@ def test_a_legend_has_a_swatch_for_every_class_in_as_many_columns_as_it_takes() 
     assert legend({}, colors, np.zeros(60, int)).ndim == 3
 
 
+def test_a_legend_of_hundreds_of_classes_is_about_as_wide_as_high() -> None:
+    for count in (300, 1000):
+        sheet = legend({k: f"object_{k:03d}" for k in range(count)}, palette(count), np.full(count, 1_000))
+        assert 0.75 < sheet.shape[1] / sheet.shape[0] < 1.25
+
+
 def test_a_saved_picture_reads_back_and_survives_a_failed_write(tmp_path: Path) -> None:
     picture = np.random.default_rng(0).integers(0, 255, (5, 7, 3), np.uint8)
     path = tmp_path / "new folder" / "picture.png"

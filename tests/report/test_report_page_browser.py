@@ -323,3 +323,7 @@ def test_levels_recolour_the_preview_and_parts_stand_under_their_object(
     assert changed(after(page, lambda: page.locator(".level").fill("0")), before) < 0.002
     page.locator("#classes .parts summary").click()
     assert page.locator("#classes .parts bdi").all_text_contents() == sorted(parts)
+    page.locator("#classes .search").fill(parts[0])
+    assert page.locator("#classes tbody tr:visible th > bdi").all_text_contents() == [
+        parts[0].removesuffix(parts[0][-2:])
+    ]
