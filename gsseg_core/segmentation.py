@@ -32,7 +32,7 @@ from gsseg_core.files.run_folder import settle
 from gsseg_core.learn.temperature import tempered
 from gsseg_core.raster.view_operator import ViewOperator
 from gsseg_core.raster.view_renderer import Blended
-from gsseg_core.refine.knn_filter import cluster_in_place, statistical_filter
+from gsseg_core.refine.knn_filter import before_clustering, cluster_in_place, statistical_filter
 from gsseg_core.refine.settings import RefineSettings
 from gsseg_core.refine.silhouette_carving import Silhouette, carve
 from gsseg_core.scene.camera import Camera
@@ -336,10 +336,8 @@ class Segmentation:
 
     @cached_property
     def _blended(self) -> tuple[CSRRows, bool]:
-        codes = tempered(self.probabilities, 1 / self.temperature)
-        codes = codes.copy() if codes is self.probabilities else codes
-        codes[self.clustered] = np.where(self.learnt.any(axis=1, keepdims=True), self.learnt, codes[self.clustered])
-        return CSRRows.from_dense(codes), bool(codes[:, 0].any())
+        codes = before_clustering(tempered(self.probabilities, 1 / self.temperature), self.clustered, self.learnt)
+        return codes, bool((codes.indices == 0).any())
 
     def save(self, path: str | os.PathLike[str], run: str | None = None) -> None:
         """Write labels, probabilities, confidence, class ids and names as one npz, atomically; ids and tree, if any.

@@ -39,7 +39,7 @@ OUTLIERS = 1e-3  # share of pixels that carry any label of the view by chance
 _PRECISION = 0.02  # of the logarithm of the temperature
 _TINY = 1e-12
 _SMALLEST = float(np.finfo(np.float32).tiny)
-_ROWS = 1 << 16  # of which powers are taken at a time
+_AT_A_TIME = 1 << 18  # shares of which powers are taken: what lies between stays in the cache
 
 
 def tempered(
@@ -56,10 +56,10 @@ def tempered(
         raise SettingsError(f"temperature is {temperature}; expected a number above 0 that float32 can hold")
     if temperature == 1:
         return shares
-    if shares.ndim != 2 or len(shares) <= _ROWS:
+    if shares.ndim != 2 or shares.size <= _AT_A_TIME:
         return _tempered(shares, temperature)
-    # Part after part, several at once: what lies between stays small.
-    parts = [slice(first, first + _ROWS) for first in range(0, len(shares), _ROWS)]
+    rows = max(_AT_A_TIME // shares.shape[1], 1)
+    parts = [slice(first, first + rows) for first in range(0, len(shares), rows)]
     out = np.empty(shares.shape, np.float32)
 
     def temper(part: slice) -> None:

@@ -8,11 +8,13 @@ from __future__ import annotations
 
 import numpy as np
 
-from gsseg_core.csr_rows import CSRRows, largest
+from gsseg_core.csr_rows import CSRRows, largest, starts
 from gsseg_core.refine.settings import RefineSettings
 from gsseg_core.spatial.class_distances import class_distances
 from gsseg_core.spatial.neighbourhood import Neighbours, neighbour_weights
 from gsseg_core.spatial.row_order import rows_by_label
+
+_ROWS = 1 << 12  # of codes that are copied at a time
 
 
 def cluster_in_place(
@@ -50,6 +52,22 @@ def cluster_in_place(
     weights = observed if evidence is None else neighbour_weights(observed, evidence)
     changed = known.average_into(codes, before, weights, wanted)
     return changed, before.take(np.flatnonzero(changed)).dense(codes.shape[1])
+
+
+def before_clustering(
+    codes: np.ndarray,  # (N, K) float32
+    clustered: np.ndarray,  # (N,) bool: which of them `cluster_in_place` changed
+    learnt: np.ndarray,  # (C, K) float32: what these were before
+) -> CSRRows:
+    """Give the codes that Gaussians have learnt themselves, and of those that learnt nothing what they are."""
+    rows, parts = starts(clustered), list[CSRRows]()
+    for first in range(0, max(len(codes), 1), _ROWS):  # A copy of all would take as much memory as they.
+        part = codes[first : first + _ROWS].copy()
+        before = learnt[rows[first] : rows[first + len(part)]]
+        known = before.any(axis=1)
+        part[np.flatnonzero(clustered[first : first + _ROWS])[known]] = before[known]
+        parts.append(CSRRows.from_dense(part))
+    return CSRRows.vstack(parts)
 
 
 def statistical_filter(

@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 import doctest
+import tracemalloc
 from typing import NamedTuple
 
 import numba as nb
@@ -12,7 +13,7 @@ from scipy.spatial.transform import Rotation
 
 from gsseg_core.errors import SettingsError
 from gsseg_core.refine import knn_filter as refine
-from gsseg_core.refine.knn_filter import cluster_in_place, statistical_filter
+from gsseg_core.refine.knn_filter import before_clustering, cluster_in_place, statistical_filter
 from gsseg_core.refine.settings import RefineSettings
 from gsseg_core.scene.gaussian_scene import GaussianScene
 from gsseg_core.spatial import class_distances as class_distances_module
@@ -272,3 +273,30 @@ def test_settings_out_of_range_are_refused_by_name(wrong):
 
 def test_examples_in_the_documentation_hold():
     assert doctest.testmod(refine).failed == 0
+
+
+@pytest.mark.parametrize("count", [0, 1, 40])
+def test_codes_of_before_clustering_are_those_learnt_and_where_there_were_none_the_new_ones(
+    count: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    rng = np.random.default_rng(count)
+    codes, clustered = rng.dirichlet(np.ones(5), count).astype(np.float32), rng.random(count) < 0.5
+    learnt = rng.dirichlet(np.ones(5), int(clustered.sum())).astype(np.float32)
+    learnt[::2] = 0
+    expected = codes.copy()
+    expected[clustered] = np.where(learnt.any(axis=1, keepdims=True), learnt, codes[clustered])
+    for rows in (7, 4096):
+        monkeypatch.setattr(refine, "_ROWS", rows)
+        np.testing.assert_array_equal(before_clustering(codes, clustered, learnt).dense(5), expected)
+
+
+def test_codes_of_before_clustering_take_no_memory_for_all_gaussians() -> None:
+    codes, clustered = np.zeros((40_000, 100), np.float32), np.zeros(40_000, bool)
+    codes[:, 3], clustered[::3] = 1, True
+    learnt = codes[clustered]
+    before_clustering(codes, clustered, learnt)  # Its kernels are there.
+    tracemalloc.start()
+    before_clustering(codes, clustered, learnt)
+    peak = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    assert peak < codes.nbytes / 2
