@@ -169,7 +169,8 @@ def _cells(points: np.ndarray, size: float) -> np.ndarray:
         if len(part) <= size:
             cell[part], count = count, count + 1
             continue
-        order = part[np.argsort(points[part, np.ptp(points[part], axis=0).argmax()], kind="stable")]
+        own = points[part]
+        order = part[np.argsort(own[:, np.ptp(own, axis=0).argmax()], kind="stable")]
         parts += [order[: len(order) // 2], order[len(order) // 2 :]]
     return cell
 
