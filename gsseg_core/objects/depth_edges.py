@@ -51,10 +51,10 @@ def depth_edges(scene: GaussianScene, operator: ViewOperator) -> DepthEdges:
     d by f (u(p + d) + u(p - d) - 2 u(p)) / u(p), f being the focal length: positive on its far side where it ends, and
     in the crease where an object stands on something.
     """
-    depth = surface(scene, operator).depth
-    grid = PixelGrid(0, -(-max(depth.shape) // _LONG_SIDE))
+    grid = PixelGrid(0, -(-max(operator.camera.width, operator.camera.height) // _LONG_SIDE))
+    depth = surface(scene, operator, grid).depth
     focal = np.sqrt(operator.camera.fx * operator.camera.fy) / grid.step
-    inverse = gaussian_filter(1 / np.maximum(grid.of(depth), 1e-9).astype(np.float64), _BLUR)
+    inverse = gaussian_filter(1 / np.maximum(depth, 1e-9).astype(np.float64), _BLUR)
     rows, columns = inverse.shape
     padded = np.pad(inverse, _REACH, mode="edge")
 

@@ -7,9 +7,12 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy import sparse
 
+from gsseg_core.csr_rows import starts
 from gsseg_core.metrics import iou
 from gsseg_core.objects.depth_edges import Borders, borders, depth_edges
-from gsseg_core.raster.observation import Observation
+from gsseg_core.objects.heaviest import heaviest
+from gsseg_core.raster.cpu.depth_sort import sort_keys
+from gsseg_core.raster.observation import LabelWeights, Observation
 from gsseg_core.raster.view_operator import ViewOperator
 from gsseg_core.scene.gaussian_scene import GaussianScene
 
@@ -26,21 +29,27 @@ class Lifted:
     @classmethod
     def of(cls, observation: Observation, kept: float = 0.8) -> Lifted:
         """Lift the ids of a mask; of each, only the heaviest Gaussians that make up a share of its weight."""
-        segments, ids, weights = observation.labels, observation.ids[observation.rows], observation.votes()
-        order = np.lexsort([ids, -weights, segments])
-        segments, ids, weights = segments[order], ids[order], weights[order]
-        size = np.bincount(segments, weights, len(observation.classes))
-        heavy = _heaviest(segments, weights, size, kept)
-        segments, ids, weights = segments[heavy], ids[heavy], weights[heavy]
+        return cls.of_weights(observation.by_label(), kept)
+
+    @classmethod
+    def of_weights(cls, seen: LabelWeights, kept: float = 0.8) -> Lifted:
+        """Lift the ids of a mask, as `of` does, from their weights."""
+        # Ascending weights of descending ids, and all of that backwards: of equal weights the lower id comes first.
+        order, _ = sort_keys(np.ascontiguousarray(seen.weights[::-1]).view(np.uint32))
+        size, heavy = heaviest(len(order) - 1 - order[::-1], seen.start, seen.weights, kept)
+        ids, weights = seen.gaussians[heavy], seen.weights[heavy]
+        start = starts(heavy)[seen.start]
         # An order that the ids have no part in: by weight, then by the first Gaussian.
         first = np.full(len(size), np.iinfo(np.int64).max)
-        np.minimum.at(first, segments, ids)
+        shown = np.diff(start) > 0
+        first[shown] = ids[start[:-1][shown]]
         order = np.lexsort([first, -size])[: np.count_nonzero(size)]
-        row = np.zeros(len(size), np.int64)
-        row[order] = np.arange(len(order))
-        gaussians, column = np.unique(ids, return_inverse=True)
-        lifted = sparse.csr_matrix((weights, (row[segments], column)), shape=(len(order), len(gaussians)))
-        return cls(observation.classes[order], gaussians, lifted)
+        present = np.zeros(int(ids.max(initial=-1)) + 1, bool)
+        present[ids] = True
+        gaussians, place = np.flatnonzero(present).astype(np.int32), np.empty(len(present), np.int32)
+        place[gaussians] = np.arange(len(gaussians), dtype=np.int32)
+        by_label = sparse.csr_matrix((weights, place[ids], start), shape=(len(size), len(gaussians)))
+        return cls(seen.classes[order], gaussians, by_label[order])
 
     def bordered(self, scene: GaussianScene, operator: ViewOperator, labels: np.ndarray) -> Lifted:
         """Measure the borders between the segments of a mask, (H, W) integers, on the surface of the scene, too."""

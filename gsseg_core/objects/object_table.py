@@ -19,6 +19,7 @@ from gsseg_core.objects.tree_growing import grow_tree
 from gsseg_core.progress import Progress, silent
 from gsseg_core.raster.backends import make_operator
 from gsseg_core.raster.observation import Observation
+from gsseg_core.raster.view_operator import ViewOperator
 from gsseg_core.scene.gaussian_scene import GaussianScene
 from gsseg_core.segmentation import REMOVED, Segmentation
 from gsseg_core.several_at_once import each_with_made
@@ -135,10 +136,16 @@ class ObjectTable:
 
     def adopt(self, view: View) -> Observation | None:
         """Add a view whose ids are the numbers of objects already; returns it lifted, None where `add` tells False."""
-        lifted = self._lift(view)
-        if self._add(view, lifted):
-            self._give(view.name, self._lifted[view.name].ids)
-        return lifted and lifted[1]
+        opened = self._open(view)
+        if opened is None:
+            return None
+        operator, labels = opened
+        observation = operator.observe(labels)
+        if not observation.num_pairs:
+            return None
+        self._add(view, Lifted.of(observation, self.settings.kept).bordered(self.scene, operator, labels))
+        self._give(view.name, self._lifted[view.name].ids)
+        return observation
 
     def reserve(self, number: int) -> None:
         """Give no new object a number up to this one."""
@@ -273,26 +280,31 @@ class ObjectTable:
             raise SettingsError(f"view {name!r} was added, and its objects are not known yet; expected solve() first")
         return self._objects[name]
 
-    def _lift(self, view: View) -> tuple[Lifted, Observation] | None:
+    def _lift(self, view: View) -> Lifted | None:
         """Lift the segments of a view to the Gaussians; None where it has no labels or sees no Gaussian."""
+        opened = self._open(view)
+        if opened is None:
+            return None
+        operator, labels = opened
+        seen = operator.lift(labels)
+        if not len(seen.gaussians):
+            return None
+        return Lifted.of_weights(seen, self.settings.kept).bordered(self.scene, operator, labels)
+
+    def _open(self, view: View) -> tuple[ViewOperator, np.ndarray] | None:
+        """Make the operator of a view, and read its labels; None where it has none."""
         if not view.has_mask:
             return None
         # Names of classes say nothing of ids that are a view's own.
         labels = replace(view, class_names=None).read_labels()
-        if not (labels >= 0).any():
-            return None
-        operator = make_operator(self.scene, view.camera, self.device)
-        observation = operator.observe(labels)
-        if not len(observation.ids):
-            return None
-        return Lifted.of(observation, self.settings.kept).bordered(self.scene, operator, labels), observation
+        return (make_operator(self.scene, view.camera, self.device), labels) if (labels >= 0).any() else None
 
-    def _add(self, view: View, lifted: tuple[Lifted, Observation] | None) -> bool:
+    def _add(self, view: View, lifted: Lifted | None) -> bool:
         if lifted is None:
             return False
         if view.name in self.views:
             self.remove(view.name)
-        self.views[view.name], self._lifted[view.name] = replace(view, class_names=None), lifted[0]
+        self.views[view.name], self._lifted[view.name] = replace(view, class_names=None), lifted
         return True
 
     def _give(self, name: str, objects: np.ndarray) -> None:

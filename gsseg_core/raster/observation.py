@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 import numba as nb
 import numpy as np
 
-from gsseg_core.csr_rows import CSRRows
+from gsseg_core.csr_rows import CSRRows, starts
 from gsseg_core.data.label_evidence import LabelEvidence, vote_units
 from gsseg_core.errors import SceneValueError
 from gsseg_core.kernels.compiler import kernel
@@ -24,6 +24,15 @@ class VoteShares(NamedTuple):
     pairs: np.ndarray  # (P,) float32: for each pair, the sum over the pixels of its label of w[p, i] / p(y_p)
     rest: np.ndarray  # (L,) float64: the same for what the rays had left over, T_end[p] / p(y_p)
     log_likelihood: float  # sum over the labelled pixels of log p(y_p), natural
+
+
+class LabelWeights(NamedTuple):
+    """W^T onehot(mask), label after label: the Gaussians that each label of a mask is on, and their weights."""
+
+    classes: np.ndarray  # (L,) int32: labels that occur in the mask, ascending
+    start: np.ndarray  # (L + 1,) int64: those of classes[l] are start[l] to start[l + 1]
+    gaussians: np.ndarray  # (P,) int32: indices in the scene, ascending for each label
+    weights: np.ndarray  # (P,) float32: in px
 
 
 class ViewPairs(NamedTuple):
@@ -87,6 +96,12 @@ class Observation(ABC):
     def votes_by_label(self) -> np.ndarray:
         """Sum of the votes of each label, (L,) float64, in px."""
         return np.bincount(self.labels, weights=self.votes(), minlength=len(self.classes))
+
+    def by_label(self) -> LabelWeights:
+        """Sort the pairs and their votes by label."""
+        order = np.argsort(self.labels.astype(np.uint16), kind="stable")  # A radix sort, as they have sixteen bits.
+        start = starts(np.bincount(self.labels, minlength=len(self.classes)))
+        return LabelWeights(self.classes, start, self.ids[self.rows[order]], self.votes()[order])
 
     @abstractmethod
     def operator(self, camera: Camera, num_gaussians: int) -> ViewRenderer:

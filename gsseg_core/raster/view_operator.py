@@ -12,7 +12,7 @@ from gsseg_core.errors import MaskFormatError, SceneValueError, SettingsError
 from gsseg_core.files.limits import MAX_LABEL
 from gsseg_core.raster.constants import BLOCK
 from gsseg_core.raster.objects_alone import ObjectsAlone
-from gsseg_core.raster.observation import Observation, check_total
+from gsseg_core.raster.observation import LabelWeights, Observation, check_total
 from gsseg_core.raster.view_renderer import ViewRenderer
 from gsseg_core.scene.gaussian_scene import GaussianScene
 
@@ -93,6 +93,15 @@ class ViewOperator(ViewRenderer):
         if evidence is not None:
             observation.evidence = evidence
         return observation
+
+    def lift(self, labels: np.ndarray) -> LabelWeights:
+        """Sum each Gaussian's weights by the labels, as for `observe`, of the pixels that it made: W^T onehot(labels).
+
+        These are the votes of what `observe` returns, for less time where nothing else is asked of a view. Raises as
+        that does.
+        """
+        self._check_labels(labels, None)
+        return self._lift(labels)
 
     def vote(
         self, labels: np.ndarray, evidence: LabelEvidence | None, total: np.ndarray, units: float, sign: int = 1
@@ -201,6 +210,9 @@ class ViewOperator(ViewRenderer):
 
     @abstractmethod
     def _observe(self, labels: np.ndarray, weights: np.ndarray | None) -> Observation: ...
+
+    def _lift(self, labels: np.ndarray) -> LabelWeights:
+        return self._observe(labels, None).by_label()
 
     def _vote(
         self, labels: np.ndarray, evidence: LabelEvidence | None, total: np.ndarray, units: float, sign: int

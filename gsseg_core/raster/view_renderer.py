@@ -105,6 +105,10 @@ class ViewRenderer(ABC):
         If only some pixels are `wanted`, (H, W) bool, others may have any value.
         """
 
+    def blend_grid(self, codes: np.ndarray, grid: PixelGrid) -> Blended:
+        """Blend codes (M, K) of `ids` alone into the pixels of a grid, (R, C, K) and (R, C); raises as `render`."""
+        return Blended(*map(grid.of, self.blend_seen(codes)))
+
     def blend_rows(self, codes: CSRRows, num_classes: int, of: np.ndarray | None = None) -> Blended:
         """Blend sparse codes, (N, K); raises as `render` does.
 

@@ -23,7 +23,9 @@ VIEWS = clean_views(8)
 def edges_of(inverse: np.ndarray, monkeypatch: pytest.MonkeyPatch) -> DepthEdges:
     """Find the edges where the inverse depth of a view is this, whatever the scene is."""
     depth = 1 / inverse
-    monkeypatch.setattr(module, "surface", lambda scene, operator: Surface(np.ones_like(depth), depth))
+    monkeypatch.setattr(
+        module, "surface", lambda scene, operator, grid: Surface(*map(grid.of, (np.ones_like(depth), depth)))
+    )
     camera = look_at("v", np.array([0, -3.0, 1.0]), width=inverse.shape[1], height=inverse.shape[0])
     return depth_edges(SCENE, make_operator(SCENE, camera))
 

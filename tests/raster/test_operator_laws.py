@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import itertools
+
 import numba
 import numpy as np
 import pytest
@@ -13,6 +15,7 @@ from operator_cases import dense, make_camera, make_scene, moved, random_mask, r
 
 from gsseg_core.data.label_evidence import LabelEvidence
 from gsseg_core.learn.learner import UNITS
+from gsseg_core.raster.view_renderer import PixelGrid
 from gsseg_core.scene.camera import Camera
 
 views = st.fixed_dictionaries(
@@ -146,7 +149,10 @@ def test_runs_and_numbers_of_threads_change_no_bit_on_the_cpu():
         results = []
         for count in (1, min(2, numba.config.NUMBA_NUM_THREADS), numba.config.NUMBA_NUM_THREADS, 1):
             numba.set_num_threads(count)
-            results.append(everything(CPU.make(scene, camera), *arguments))
+            operator = CPU.make(scene, camera)
+            results.append(everything(operator, *arguments))
+            results[-1]["lifted"] = operator.lift(arguments[2]).weights
+            results[-1]["on a grid"] = operator.blend_grid(arguments[0][operator.ids, :3], PixelGrid(1, 3)).image
     finally:
         numba.set_num_threads(threads)
     for other in results[1:]:
@@ -192,6 +198,36 @@ def test_votes_are_the_adjoint_of_the_one_hot_mask_by_rays_that_end_at_surfaces(
     one_hot = (mask.reshape(-1, 1) == np.arange(9)).astype(np.float32)
     votes = spread(operator, seen, seen.votes(), 9)
     np.testing.assert_allclose(votes, naive.weights.T @ one_hot, rtol=5 * backend.sum, atol=5 * backend.sum)
+
+
+@few
+@given(views)
+def test_a_mask_is_lifted_to_the_votes_of_its_observation_to_the_last_bit_label_by_label(backend, view):
+    scene, camera = random_view(**view)
+    operator, mask = backend.make(scene, camera), random_mask(view["seed"], camera.width, camera.height)
+    seen, lifted = operator.observe(mask), operator.lift(mask)
+    np.testing.assert_array_equal(lifted.classes, seen.classes)
+    votes = seen.dense(seen.votes())
+    for label, (first, last) in enumerate(itertools.pairwise(lifted.start)):
+        rows = np.flatnonzero(votes[:, label])
+        np.testing.assert_array_equal(lifted.gaussians[first:last], seen.ids[rows])
+        np.testing.assert_array_equal(lifted.weights[first:last], votes[rows, label])
+
+
+def test_a_mask_of_which_nothing_is_known_is_lifted_to_nothing(backend):
+    scene, camera = random_view(3)
+    lifted = backend.make(scene, camera).lift(np.full((camera.height, camera.width), -1))
+    assert lifted.start.tolist() == [0] and not any(len(part) for part in (lifted.classes, lifted.gaussians))
+
+
+@few
+@given(views, st.integers(0, 45), st.integers(1, 20), st.integers(0, 6))
+def test_the_pixels_of_a_grid_are_blended_as_in_the_whole_image_to_the_last_bit(backend, view, first, step, channels):
+    scene, camera = random_view(**view)
+    operator, grid = backend.make(scene, camera), PixelGrid(first, step)
+    codes = np.random.default_rng(view["seed"]).random((len(operator.ids), channels)).astype(np.float32)
+    for found, image in zip(operator.blend_grid(codes, grid), operator.blend_seen(codes), strict=True):
+        np.testing.assert_array_equal(found, grid.of(image))
 
 
 @few

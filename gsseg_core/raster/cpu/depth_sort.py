@@ -1,4 +1,4 @@
-"""Sorts positive float32 keys, by their bits, in parallel and in the same way on any number of threads."""
+"""Sorts uint32 keys, or positive float32 by their bits, in parallel and in the same way on any number of threads."""
 
 from __future__ import annotations
 
@@ -12,11 +12,17 @@ PARTS = 4  # parts that are counted and moved beside each other; fixed, so that 
 
 
 def sort_by_depth(depth: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Order (M,) int32 that sorts depths, (M,) float32 > 0, and the sorted depths; equal ones stay in their order.
+    """Order (M,) int32 that sorts depths, (M,) float32 > 0, and the sorted depths; equal ones stay in their order."""
+    order, keys = sort_keys(depth.view(np.uint32))
+    return order, keys.view(np.float32)
+
+
+def sort_keys(keys: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Order (M,) int32 that sorts keys, (M,) uint32, and the sorted keys; equal ones stay in their order.
 
     A radix sort: every pass moves the keys stably by one digit, the least significant first.
     """
-    keys, order = depth.view(np.uint32), np.arange(len(depth), dtype=np.int32)
+    order = np.arange(len(keys), dtype=np.int32)
     for shift in range(0, 32, DIGIT_BITS):
         counts = np.zeros((PARTS, 1 << DIGIT_BITS), np.int64)
         _count_digits(keys, shift, counts)
@@ -27,7 +33,7 @@ def sort_by_depth(depth: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         moved_keys, moved_order = np.empty_like(keys), np.empty_like(order)
         _move(keys, order, shift, place, moved_keys, moved_order)
         keys, order = moved_keys, moved_order
-    return order, keys.view(np.float32)
+    return order, keys
 
 
 @kernel(parallel=True)

@@ -53,13 +53,16 @@ def _four_of(build: Builder, position: int, i: int, block: Any) -> Any:
     return build.llvm.shuffle_vector(four, ir.Constant(_FOUR, ir.Undefined), _EACH_FOUR_TIMES)
 
 
-def _alpha(build: Builder, first: int) -> tuple[Any, Any]:
-    """Alpha in a block, and log2 of it before it is clipped; arguments from `first` on: block, lines and width."""
+def _power(build: Builder, first: int) -> Any:
+    """Log2 of alpha in a block, before it is clipped; arguments from `first` on: block, lines and width."""
     block, _, width = build.arguments[first : first + 3]
     offset = build.llvm.fsub(_pixel_columns(build, block), _four_of(build, first + 1, 0, block))
     peak, wide = _four_of(build, first + 1, 1, block), build.broadcast(build.llvm.fneg(width))
-    power = build.fma(wide, build.llvm.fmul(offset, offset), peak)
-    return build.minimum(build.exp2(power), constant(ALPHA_MAX)), power
+    return build.fma(wide, build.llvm.fmul(offset, offset), peak)
+
+
+def _alpha(build: Builder, power: Any) -> Any:
+    return build.minimum(build.exp2(power), constant(ALPHA_MAX))
 
 
 def _pixel_columns(build: Builder, block: Any) -> Any:
@@ -104,10 +107,10 @@ def aim(build: Builder, table: Any, g: Any, left: Any, top: Any, lines: Any) -> 
     return llvm.and_(bits, ir.Constant(I64, OPEN))
 
 
-_BLENDED: Any = types.Tuple((row_type, types.int64))  # type: ignore[no-untyped-call]
+_FOUND: Any = types.Tuple((row_type, types.int64))  # type: ignore[no-untyped-call]
 
 
-@operation(_BLENDED, None, None, None, types.float32)
+@operation(_FOUND, None, None, None, types.float32)
 def blend_block(build: Builder, rays: Any, b: Any, lines: Any, wide: Any) -> Any:
     """Blend one Gaussian into block b of the rays.
 
@@ -118,22 +121,50 @@ def blend_block(build: Builder, rays: Any, b: Any, lines: Any, wide: Any) -> Any
     return _blended(build, lifts=False)
 
 
-@operation(_BLENDED, None, None, None, types.float32)
+@operation(_FOUND, None, None, None, types.float32)
 def lift_block(build: Builder, rays: Any, b: Any, lines: Any, wide: Any) -> Any:
     """Blend one Gaussian into block b of rays that lift a mask: as `blend_block`, but they end as `T_LIFTED` says."""
     return _blended(build, lifts=True)
 
 
+@operation(_FOUND, None, None, None, None, types.intp, types.float32, types.float32)
+def reach_pixels(build: Builder, rows: Any, columns: Any, b: Any, table: Any, g: Any, left: Any, top: Any) -> Any:
+    """Tell which of any sixteen pixels of a tile a Gaussian reaches, by bits, and log2 of its alpha there.
+
+    Their rows and columns in the tile are in row b of the two arrays. What comes out is bit for bit what `aim` and
+    `blend_block` find.
+    """
+    llvm, column, number = build.llvm, _projected(build, 3), build.arguments[2]
+    dy = llvm.fsub(build.load(build.address(0, number)), build.broadcast(llvm.fsub(column(V), top)))
+    x = build.fma(build.broadcast(column(SHEAR)), dy, build.broadcast(llvm.fsub(column(U), left)))
+    high, wide = build.broadcast(llvm.fneg(column(HEIGHT))), build.broadcast(llvm.fneg(column(WIDTH)))
+    peak = build.fma(high, llvm.fmul(dy, dy), build.broadcast(column(LOG_OPACITY)))
+    offset = llvm.fsub(build.load(build.address(1, number)), x)
+    power = build.fma(wide, llvm.fmul(offset, offset), peak)
+    found = build.bits(llvm.fcmp_ordered(">=", power, constant(LOG_ALPHA_MIN)))
+    return build.context.make_tuple(llvm, build.signature.return_type, [power, found])
+
+
+@operation(_FOUND, None, None, row_type)
+def blend_pixels(build: Builder, rays: Any, b: Any, power: Any) -> Any:
+    """Blend one Gaussian into the pixels of `reach_pixels`, which are row b of the rays, as `blend_block` does."""
+    return _taken(build, power, lifts=False)
+
+
 def _blended(build: Builder, lifts: bool) -> Any:
     """Weights and bits of `blend_block`, or of `lift_block`; what is left of the rays is stored."""
+    return _taken(build, _power(build, 1), lifts)
+
+
+def _taken(build: Builder, power: Any, lifts: bool) -> Any:
+    """Take what one Gaussian takes of sixteen rays, by log2 of its alpha."""
     llvm = build.llvm
-    alpha, power = _alpha(build, 1)
     address = build.row(0)
     before = build.load(address)
     hit = llvm.and_(
         llvm.fcmp_ordered(">=", power, constant(LOG_ALPHA_MIN)), llvm.fcmp_ordered(">=", before, constant(T_MIN))
     )
-    weight = llvm.select(hit, llvm.fmul(alpha, before), constant(0.0))
+    weight = llvm.select(hit, llvm.fmul(_alpha(build, power), before), constant(0.0))
     after = llvm.fsub(before, weight)
     goes_on = llvm.fcmp_ordered(">=", after, constant(T_LIFTED if lifts else T_MIN))
     if lifts:  # A ray that has ended has nothing left, so it stays as it is.
@@ -146,5 +177,6 @@ def _blended(build: Builder, lifts: bool) -> Any:
 @operation(row_type, None, None, types.float32)
 def alpha_of(build: Builder, b: Any, lines: Any, wide: Any) -> Any:
     """Alpha of one Gaussian in block b, as `blend_block` has it, whatever lies in front."""
-    alpha, power = _alpha(build, 0)
-    return build.llvm.select(build.llvm.fcmp_ordered(">=", power, constant(LOG_ALPHA_MIN)), alpha, constant(0.0))
+    power = _power(build, 0)
+    found = build.llvm.fcmp_ordered(">=", power, constant(LOG_ALPHA_MIN))
+    return build.llvm.select(found, _alpha(build, power), constant(0.0))

@@ -13,13 +13,15 @@ from gsseg_core.data.label_evidence import LabelEvidence
 from gsseg_core.raster.constants import CHANNELS, CHUNKS
 from gsseg_core.raster.cpu import label_pairs, products
 from gsseg_core.raster.cpu.entry_votes import add_entry_votes
+from gsseg_core.raster.cpu.grid_blending import render_grid
+from gsseg_core.raster.cpu.label_weights import label_weights
 from gsseg_core.raster.cpu.lifting import Lifted
 from gsseg_core.raster.cpu.objects_alone import TileObjects
 from gsseg_core.raster.cpu.projection import joined, project
 from gsseg_core.raster.cpu.splat import HEIGHT, LOG_OPACITY, WIDTH
 from gsseg_core.raster.cpu.tiling import TILE, Tiles, assign
 from gsseg_core.raster.objects_alone import ObjectsAlone
-from gsseg_core.raster.observation import Observation, VoteShares
+from gsseg_core.raster.observation import LabelWeights, Observation, VoteShares
 from gsseg_core.raster.view_operator import ViewOperator
 from gsseg_core.raster.view_renderer import NO_PIXELS, Blended, PixelGrid, Strongest
 from gsseg_core.scene.camera import Camera
@@ -68,6 +70,13 @@ class TileOperator(ViewOperator):
         rows = np.arange(len(codes), dtype=np.int32)
         return Blended(*products.render(self._tiles, CSRRows.from_dense(codes), rows, codes.shape[1]))
 
+    def blend_grid(self, codes: np.ndarray, grid: PixelGrid) -> Blended:
+        """Blend few codes into the pixels of a grid, without the others."""
+        if codes.shape[1] > products.FEW:
+            return super().blend_grid(codes, grid)
+        self._check_rows(len(codes), self.ids)
+        return Blended(*render_grid(self._tiles, np.ascontiguousarray(codes, np.float32), *grid))
+
     def blend_rows(self, codes: CSRRows, num_classes: int, of: np.ndarray | None = None) -> Blended:
         """Blend codes without their zeros."""
         return Blended(*products.render(self._tiles, codes, self._rows(codes, num_classes, of), num_classes))
@@ -107,6 +116,9 @@ class TileOperator(ViewOperator):
 
     def _observe(self, labels: np.ndarray, weights: np.ndarray | None) -> Observation:
         return TileObservation(self.camera.name, self.ids, self._tiles, Lifted.of(self._tiles, labels, weights))
+
+    def _lift(self, labels: np.ndarray) -> LabelWeights:
+        return label_weights(self.ids, self._tiles, Lifted.of(self._tiles, labels))
 
     def _vote(
         self, labels: np.ndarray, evidence: LabelEvidence | None, total: np.ndarray, units: float, sign: int
