@@ -30,6 +30,8 @@ from gsseg_core.objects.column_products import column_products
 from gsseg_core.objects.object_table import ObjectTable
 from gsseg_core.raster.backends import make_operator
 from gsseg_core.raster.cpu.occlusion import ray_ends
+from gsseg_core.raster.depth import surface
+from gsseg_core.raster.view_renderer import PixelGrid
 from gsseg_core.refine.label_propagation import propagate
 from gsseg_core.refine.settings import PAPER
 from gsseg_core.scene.camera import Camera
@@ -151,6 +153,7 @@ def _learn_something(device: str) -> None:
     operator.weights()
     ray_ends(scene, camera, labels)
     ObjectTable(scene, device=device).add(view)
+    surface(scene, operator, PixelGrid(0, 2))  # as for larger views
 
 
 def refine_something(device: str = "cpu") -> None:

@@ -68,14 +68,18 @@ session, data = LivingSession(GaussianScene.load({scene!r})), Dataset({data!r})
 assert not any(map(session.fuse, data.views("train")))
 session.update(SceneDelta(removed=np.arange(5)))
 session.segmentation()""",
-    "weights": """
+    "weights and depth": """
 import numpy as np
 from gsseg_core.data.dataset import Dataset
 from gsseg_core.raster.backends import make_operator
+from gsseg_core.raster.depth import surface
+from gsseg_core.raster.view_renderer import PixelGrid
 from gsseg_core.scene.gaussian_scene import GaussianScene
 camera = Dataset({data!r}).views("train")[0].camera
-operator = make_operator(GaussianScene.load({scene!r}), camera)
+scene = GaussianScene.load({scene!r})
+operator = make_operator(scene, camera)
 operator.weights()
+surface(scene, operator, PixelGrid(0, 4))
 operator.adjoint(np.ones((camera.height, camera.width, 2)))""",
     "move outlines": """
 import numpy as np

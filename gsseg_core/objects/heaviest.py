@@ -15,7 +15,7 @@ def heaviest(
 ) -> tuple[np.ndarray, np.ndarray]:  # fmt: skip
     """Add up the weights of each segment, (L,) float64, and find the heaviest that make up a share of that, (P,) bool.
 
-    Sums run over all segments, heaviest first, so that what is found is the same bit for bit however it is computed.
+    The sum that tells what is heavier runs on from segment to segment, as `np.cumsum` over all pairs would.
     """
     segments, ranked = np.empty(len(weights), np.int32), np.empty(len(weights), np.int32)
     place, size, heavy = start[:-1].copy(), np.zeros(len(start) - 1), np.empty(len(weights), np.bool_)

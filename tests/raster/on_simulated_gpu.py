@@ -122,6 +122,17 @@ def test_votes_and_shares_are_those_of_the_cpu(weighted: bool) -> None:
     assert shares[1].log_likelihood == pytest.approx(shares[0].log_likelihood, rel=1e-5)
 
 
+def test_a_lifted_mask_and_the_pixels_of_a_grid_are_those_of_the_cpu() -> None:
+    ours, theirs = (operator.lift(MASK) for operator in operators())
+    for name in ("classes", "start", "gaussians"):
+        np.testing.assert_array_equal(getattr(theirs, name), getattr(ours, name), err_msg=name)
+    np.testing.assert_allclose(theirs.weights, ours.weights, rtol=1e-5, atol=1e-5)
+    grid, codes = PixelGrid(1, 3), RNG.random((len(SCENE), 2), np.float32)
+    images = [operator.blend_grid(codes[operator.ids], grid) for operator in operators()]
+    for found, image in zip(images[1], images[0], strict=True):
+        np.testing.assert_allclose(found, image, atol=NEAR)
+
+
 @pytest.mark.parametrize("fits", [True, False])
 def test_votes_of_many_views_are_summed_where_they_lie_and_end_on_the_cpu(
     fits: bool, monkeypatch: pytest.MonkeyPatch

@@ -7,7 +7,8 @@ import numpy as np
 
 from gsseg_core.kernels.compiler import kernel
 
-DIGIT_BITS = 11  # three digits make up a key; counts of one fit the fastest cache
+FEW = 1 << 20  # keys: of more, those that are moved would go to too many places at once for the cache
+DIGIT_BITS = (11, 8)  # of few keys, whose three digits are counted in the fastest cache, and of more
 PARTS = 4  # parts that are counted and moved beside each other; fixed, so that threads change nothing
 
 
@@ -23,8 +24,9 @@ def sort_keys(keys: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     A radix sort: every pass moves the keys stably by one digit, the least significant first.
     """
     order = np.arange(len(keys), dtype=np.int32)
-    for shift in range(0, 32, DIGIT_BITS):
-        counts = np.zeros((PARTS, 1 << DIGIT_BITS), np.int64)
+    bits = DIGIT_BITS[len(keys) > FEW]
+    for shift in range(0, 32, bits):
+        counts = np.zeros((PARTS, 1 << bits), np.int64)
         _count_digits(keys, shift, counts)
         if (counts.sum(axis=0) == len(keys)).any():
             continue  # All keys have the same digit.
@@ -38,7 +40,7 @@ def sort_keys(keys: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 @kernel(parallel=True)
 def _count_digits(keys: np.ndarray, shift: int, counts: np.ndarray) -> None:
-    count, mask = keys.shape[0], np.uint32((1 << DIGIT_BITS) - 1)
+    count, mask = keys.shape[0], np.uint32(counts.shape[1] - 1)
     for chunk in nb.prange(PARTS):
         for i in range(chunk * count // PARTS, (chunk + 1) * count // PARTS):
             counts[chunk, (keys[i] >> np.uint32(shift)) & mask] += 1
@@ -47,10 +49,10 @@ def _count_digits(keys: np.ndarray, shift: int, counts: np.ndarray) -> None:
 @kernel(parallel=True)
 def _move(
     keys: np.ndarray, order: np.ndarray, shift: int,  # (M,) uint32, (M,) int32
-    place: np.ndarray,  # (PARTS, 2^DIGIT_BITS) where the next key of each digit goes
+    place: np.ndarray,  # (PARTS, digits) where the next key of each digit goes
     moved_keys: np.ndarray, moved_order: np.ndarray,  # (M,) out, each
 ) -> None:  # fmt: skip
-    count, mask = keys.shape[0], np.uint32((1 << DIGIT_BITS) - 1)
+    count, mask = keys.shape[0], np.uint32(place.shape[1] - 1)
     for chunk in nb.prange(PARTS):
         for i in range(chunk * count // PARTS, (chunk + 1) * count // PARTS):
             digit = (keys[i] >> np.uint32(shift)) & mask

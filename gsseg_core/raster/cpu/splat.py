@@ -62,6 +62,7 @@ def _power(build: Builder, first: int) -> Any:
 
 
 def _alpha(build: Builder, power: Any) -> Any:
+    """Alpha by log2 of it."""
     return build.minimum(build.exp2(power), constant(ALPHA_MAX))
 
 

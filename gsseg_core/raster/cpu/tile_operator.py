@@ -71,8 +71,8 @@ class TileOperator(ViewOperator):
         return Blended(*products.render(self._tiles, CSRRows.from_dense(codes), rows, codes.shape[1]))
 
     def blend_grid(self, codes: np.ndarray, grid: PixelGrid) -> Blended:
-        """Blend few codes into the pixels of a grid, without the others."""
-        if codes.shape[1] > products.FEW:
+        """Blend codes into the pixels of a grid, without the others where that is the faster way."""
+        if grid.step == 1 or codes.shape[1] > products.FEW:
             return super().blend_grid(codes, grid)
         self._check_rows(len(codes), self.ids)
         return Blended(*render_grid(self._tiles, np.ascontiguousarray(codes, np.float32), *grid))
