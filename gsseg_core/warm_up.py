@@ -27,7 +27,7 @@ from gsseg_core.learn.vote_learner import VoteLearner
 from gsseg_core.learn.vote_resolution import resolved_votes
 from gsseg_core.objects.clicks import merge_tree
 from gsseg_core.objects.column_products import column_products
-from gsseg_core.objects.object_table import ObjectTable
+from gsseg_core.objects.heaviest import heaviest
 from gsseg_core.raster.backends import make_operator
 from gsseg_core.raster.cpu.occlusion import ray_ends
 from gsseg_core.raster.depth import surface
@@ -152,7 +152,8 @@ def _learn_something(device: str) -> None:
     operator.adjoint(np.ones((*labels.shape, 1), np.float32))
     operator.weights()
     ray_ends(scene, camera, labels)
-    ObjectTable(scene, device=device).add(view)
+    seen = operator.lift(labels)
+    heaviest(seen.start, seen.weights, 0.8)
     surface(scene, operator, PixelGrid(0, 2))  # as for larger views
 
 

@@ -11,7 +11,6 @@ from gsseg_core.csr_rows import starts
 from gsseg_core.metrics import iou
 from gsseg_core.objects.depth_edges import Borders, borders, depth_edges
 from gsseg_core.objects.heaviest import heaviest
-from gsseg_core.raster.cpu.depth_sort import sort_keys
 from gsseg_core.raster.observation import LabelWeights, Observation
 from gsseg_core.raster.view_operator import ViewOperator
 from gsseg_core.scene.gaussian_scene import GaussianScene
@@ -34,9 +33,7 @@ class Lifted:
     @classmethod
     def of_weights(cls, seen: LabelWeights, kept: float = 0.8) -> Lifted:
         """Lift the ids of a mask, as `of` does, from their weights."""
-        # Ascending weights of descending ids, and all of that backwards: of equal weights the lower id comes first.
-        order, _ = sort_keys(np.ascontiguousarray(seen.weights[::-1]).view(np.uint32))
-        size, heavy = heaviest(len(order) - 1 - order[::-1], seen.start, seen.weights, kept)
+        size, heavy = heaviest(seen.start, seen.weights, kept)
         ids, weights = seen.gaussians[heavy], seen.weights[heavy]
         start = starts(heavy)[seen.start]
         # An order that the ids have no part in: by weight, then by the first Gaussian.
