@@ -38,17 +38,19 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
 from scipy import sparse
 
 from gsseg_core.errors import SettingsError
+from gsseg_core.objects.association_kernels import dots_of_pairs
 from gsseg_core.objects.depth_edges import Borders
-from gsseg_core.objects.lifted_segments import Lifted, Profiles, sums
+from gsseg_core.objects.lifted_segments import Lifted, Profiles
+from gsseg_core.objects.sparse_products import product_above
+from gsseg_core.objects.stacked_segments import Stack, grouping
 
-_PAIRS = 1 << 15  # so many pairs at a time, to keep memory small
 _BEST = 0.75  # pairs that agree nearly as well as the best one merge at once, before anything is compared anew
 _MOST = 0.6  # agreement above which clusters are one object whatever the segmenter does
 _WHOLE = 0.5  # the level where segmenters hardly ever split an object, or too little is known
@@ -118,150 +120,144 @@ def associate(views: Mapping[str, Lifted], settings: AssociationSettings | None 
     names = sorted(views)
     if not names:
         return Association({}, settings.agreement or _WHOLE)
-    stack = _Stack([views[name] for name in names])
+    stack = Stack([views[name] for name in names])
     clusters, agreement = _merge(stack, settings)
     objects = _by_size(_move(stack, clusters, settings), stack)
     return Association(dict(zip(names, np.split(objects, stack.starts[1:-1]), strict=True)), agreement)
 
 
-class _Stack:
-    """Segments of all views, stacked as the rows of one sparse matrix."""
-
-    def __init__(self, views: list[Lifted]) -> None:
-        self.starts = np.concatenate([[0], np.cumsum([len(view) for view in views])])
-        self.view = np.repeat(np.arange(len(views)), np.diff(self.starts))
-        self.background = np.concatenate([view.ids for view in views]) == 0
-        self.size = np.concatenate([sums(view.weights, 1) for view in views])
-        # Gaussians that nobody sees take no part; those that are left are numbered anew.
-        present, where = np.unique(np.concatenate([view.gaussians for view in views]), return_inverse=True)
-        numbers = np.split(where, np.cumsum([len(view.gaussians) for view in views])[:-1])
-        self.views = [replace(view, gaussians=ids) for view, ids in zip(views, numbers, strict=True)]
-        self.num_gaussians = len(present)
-
-    def borders(self) -> Borders:
-        """Between the segments of each view."""
-        parts = zip(*(view.borders or Borders.empty(len(view)) for view in self.views), strict=True)
-        return Borders(*(sparse.block_diag(part, format="csr") for part in parts))
-
-    def overlaps(self) -> tuple[sparse.csr_matrix, np.ndarray]:
-        """O (n, n), and V (n, views)."""
-        scaled, seen = [], []
-        for view in self.views:
-            weights, root = view.weights, np.sqrt(sums(view.weights, 0)).astype(np.float32)
-            entries = weights.data / root[weights.indices], view.gaussians[weights.indices], weights.indptr
-            scaled.append(sparse.csr_matrix(entries, shape=(len(view), self.num_gaussians)))
-            seen.append(sparse.csr_matrix((root, view.gaussians, [0, len(root)]), shape=(1, self.num_gaussians)))
-        stacked = sparse.vstack(scaled, format="csr")
-        return (stacked @ stacked.T).tocsr(), (stacked @ sparse.vstack(seen, format="csr").T).toarray()
-
-
-def _merge(stack: _Stack, settings: AssociationSettings) -> tuple[np.ndarray, float]:
+def _merge(stack: Stack, settings: AssociationSettings) -> tuple[np.ndarray, float]:
     """Cluster the segments, and say down to which agreement.
 
     All of the background are cluster 0, the others are numbered from 1.
     """
-    single, sure = _Clusters.single(stack), max(settings.agreement or 0, _MOST)
-    clusters, votes = _merged(single, stack.view, settings, sure, surface=0.0)
-    doubted = votes.doubted(clusters.touching)
+    start = _Clusters.single(stack)
+    single = start, _Votes.of(start, np.arange(len(start.seen)), stack.view, settings)
+    sure = max(settings.agreement or 0, _MOST)
+    clusters, votes = _merged(*single, stack.view, sure, surface=0.0)
+    doubted = votes.doubted(_touching(stack, clusters))
     split = _in_parts(doubted)
     if split > 0:  # Begun again, so that depth edges count from the first pair on.
-        clusters, votes = _merged(single, stack.view, settings, sure, surface=split)
+        clusters, votes = _merged(*single, stack.view, sure, surface=split)
     agreement = settings.agreement or votes.merging_level(doubted)
-    clusters, _ = _merged(clusters, stack.view, settings, agreement, surface=split)
+    clusters, _ = _merged(clusters, votes, stack.view, agreement, surface=split)
     merged = np.zeros(len(stack.view), np.int64)
     merged[~stack.background] = clusters.of + 1
     return merged, agreement
 
 
 class _Clusters(NamedTuple):
-    """C clusters that segments of objects make up, and what they have in common with all n segments."""
+    """C clusters that A segments of objects make up, and what they have in common with all n segments."""
 
-    of: np.ndarray  # the cluster of each segment that is not background
-    overlap: sparse.csr_matrix  # (C, n): O, that with the background left out
+    of: np.ndarray  # (A,): the cluster of each
+    overlap: sparse.csr_matrix  # (A, n): O, that with the background left out
     seen: np.ndarray  # (C, views): V
     hidden: np.ndarray  # (C, views): what of it the view calls background
-    touching: sparse.csr_matrix  # (C, C): pairs of segments of one view that touch
     borders: Borders  # of C clusters
 
     @classmethod
-    def single(cls, stack: _Stack) -> _Clusters:
+    def single(cls, stack: Stack) -> _Clusters:
         """Start with each segment by itself."""
-        overlap, seen = stack.overlaps()
         nodes = np.flatnonzero(~stack.background)
-        touching = _same_view(overlap, stack.view)[nodes][:, nodes]
-        hidden = np.zeros_like(seen)
-        hidden[:, stack.view[stack.background]] = overlap[:, stack.background].toarray()
-        overlap.data[stack.background[overlap.indices]] = 0
-        overlap.eliminate_zeros()
         borders = Borders(*(part[nodes][:, nodes] for part in stack.borders()))
-        return cls(np.arange(len(nodes)), overlap[nodes], seen[nodes], hidden[nodes], touching, borders)
+        return cls(np.arange(len(nodes)), *stack.overlaps(), borders)
 
-    def merged(self, target: np.ndarray) -> _Clusters:  # (C,): whom each one becomes
-        number = np.unique(target, return_inverse=True)[1]
-        # Ones that add up the rows of each cluster, (C', C).
-        groups = sparse.csr_matrix((np.ones(len(number), np.float32), (number, np.arange(len(number)))))
-        touching, *borders = ((groups @ part @ groups.T).tocsr() for part in (self.touching, *self.borders))
-        overlap, seen, hidden = (groups @ self.overlap).tocsr(), groups @ self.seen, groups @ self.hidden
-        return _Clusters(number[self.of], overlap, seen, hidden, touching, Borders(*borders))
+    def merged(self, number: np.ndarray) -> _Clusters:  # (C,): which cluster each one becomes
+        groups = grouping(number)
+        borders = Borders(*((groups @ part @ groups.T).tocsr() for part in self.borders))
+        return self._replace(of=number[self.of], seen=groups @ self.seen, hidden=groups @ self.hidden, borders=borders)
 
 
 def _merged(
-    clusters: _Clusters, view: np.ndarray, settings: AssociationSettings, level: float, surface: float
+    clusters: _Clusters, votes: _Votes, view: np.ndarray, level: float, surface: float
 ) -> tuple[_Clusters, _Votes]:
-    """Merge clusters down to a level, depth edges counting by `surface`, 0 to 1; also return the last votes."""
-    while True:
-        votes = _Votes.of(clusters, view, settings)
-        target = _match(votes.pairs(clusters.borders, surface, level), len(clusters.seen), level)
-        if target is None:
-            return clusters, votes
-        clusters = clusters.merged(target)
+    """Merge clusters down to a level, depth edges counting by `surface`, 0 to 1.
+
+    After a step, only those that have merged are compared anew.
+    """
+    pairs = votes.pairs(np.arange(len(clusters.seen)), clusters.borders, surface, level)
+    while len(pairs.first):
+        alive, number = np.unique(_match(pairs, len(clusters.seen)), return_inverse=True)
+        unchanged = np.bincount(number) == 1
+        changed = np.flatnonzero(~unchanged)
+        clusters = clusters.merged(number)
+        votes = votes.replaced(alive[unchanged], changed, _Votes.of(clusters, changed, view, votes.settings))
+        pairs = pairs.among(number, unchanged).and_(votes.pairs(changed, clusters.borders, surface, level))
+    return clusters, votes
 
 
 class _Pairs(NamedTuple):
-    """Pairs of clusters that some view shows whole under one id, (P,) each."""
+    """Pairs of clusters that agree, (P,) each."""
 
     first: np.ndarray
     second: np.ndarray  # larger than the first
-    score: np.ndarray  # agreement; 0 where too few views see both
+    score: np.ndarray  # agreement
+
+    def among(self, number: np.ndarray, unchanged: np.ndarray) -> _Pairs:
+        """Take the pairs of clusters that have not changed, (C',) bool, under their new numbers, of (C,)."""
+        first, second = number[self.first], number[self.second]
+        kept = unchanged[first] & unchanged[second]
+        return _Pairs(first[kept], second[kept], self.score[kept])
+
+    def and_(self, others: _Pairs) -> _Pairs:
+        """Add others."""
+        return _Pairs(*(np.concatenate(both) for both in zip(self, others, strict=True)))
 
 
 class _Votes(NamedTuple):
     """How the views show C clusters."""
 
-    whole: sparse.csr_matrix  # (C, n): how whole each segment shows each cluster, times what its view counts for that
+    whole: sparse.csr_matrix  # (C, n) float32: how whole each segment shows each cluster, times what its view counts
     counts: np.ndarray  # (C, views): 0 to 1, by how much of a cluster the view sees
     shown: np.ndarray  # (C, views): how whole the view shows it under any id, times counts
     settings: AssociationSettings
 
     @classmethod
-    def of(cls, clusters: _Clusters, view: np.ndarray, settings: AssociationSettings) -> _Votes:
-        """Let the views vote. Who calls a cluster background says nothing of which object it is."""
-        foreground = np.maximum(clusters.seen - clusters.hidden, 0)
-        counts = settings.sight(foreground, clusters.seen.max(axis=1, keepdims=True, initial=0))
-        entries = clusters.overlap.tocoo()
-        share = entries.data / np.maximum(foreground[entries.row, view[entries.col]], 1e-9)
-        strong = share > settings.least_share
-        row, col = entries.row[strong], entries.col[strong]
-        grown = (share[strong] - settings.least_share) / (settings.whole_share - settings.least_share)
+    def of(cls, clusters: _Clusters, which: np.ndarray, view: np.ndarray, settings: AssociationSettings) -> _Votes:
+        """Let the views vote on some clusters. Who calls a cluster background says nothing of which object it is."""
+        seen = clusters.seen[which]
+        foreground = np.maximum(seen - clusters.hidden[which], 0)
+        counts = settings.sight(foreground, seen.max(axis=1, keepdims=True, initial=0))
+        groups = grouping(clusters.of)[which]
+        strong = product_above(groups, clusters.overlap, settings.least_share * foreground, view).tocoo()
+        row, col = strong.row, strong.col
+        share = strong.data / np.maximum(foreground[row, view[col]], 1e-9)
+        grown = (share - settings.least_share) / (settings.whole_share - settings.least_share)
         whole = np.minimum(grown, 1) * counts[row, view[col]]
         shown = np.zeros_like(counts)
         np.maximum.at(shown, (row, view[col]), whole)
-        return cls(sparse.csr_matrix((whole, (row, col)), shape=clusters.overlap.shape), counts, shown, settings)
+        rows = sparse.csr_matrix((whole.astype(np.float32), (row, col)), shape=strong.shape)
+        return cls(rows, counts, shown, settings)
 
-    def pairs(self, borders: Borders, surface: float, level: float) -> _Pairs:
-        """Compare all clusters that any id shows whole together, and that may agree by more than a level.
+    def replaced(self, kept: np.ndarray, changed: np.ndarray, by: _Votes) -> _Votes:
+        """Keep the rows of some clusters, and put those of others between them: at the places `changed`, ascending."""
+        order = np.insert(np.arange(len(kept)), changed - np.arange(len(changed)), len(kept) + np.arange(len(changed)))
+        counts, shown = (np.concatenate([old[kept], new])[order] for old, new in zip(self[1:3], by[1:3], strict=True))
+        whole = sparse.vstack([self.whole[kept], by.whole], format="csr")[order]
+        return _Votes(whole, counts, shown, self.settings)
+
+    def pairs(self, of: np.ndarray, borders: Borders, surface: float, level: float) -> _Pairs:
+        """Compare clusters, ascending, with all that any id shows whole together with them; return who agree enough.
 
         Depth edges count by `surface`, 0 to 1.
         """
-        together = sparse.triu(self.whole @ self.whole.T, 1).tocoo()
         # No fewer views see both, or show each whole, than show both whole together.
-        likely = together.data * (_FACTORS[1] if surface > 0 else 1) > level * (together.data + self.settings.doubt)
-        first, second = together.row[likely], together.col[likely]
+        least = level * self.settings.doubt / ((_FACTORS[1] if surface > 0 else 1) - level)
+        bar, group = np.full((len(of), 1), least), np.zeros(self.whole.shape[0])
+        together = product_above(self.whole[of], self.whole.T.tocsr(), bar, group).tocoo()
+        first, second = of[together.row], together.col
+        # Each pair once, and none with itself.
+        asked = np.zeros(len(group), bool)
+        asked[of] = True
+        once = (first < second) | ((first > second) & ~asked[second])
+        first, second, together = first[once], second[once], together.data[once].astype(np.float64)
+        first, second = np.minimum(first, second), np.maximum(first, second)
         see, show = self._views_of_both(first, second)
-        score = np.where(see >= self.settings.evidence, self._agreement(together.data[likely], see, show), 0)
+        score = np.where(see >= self.settings.evidence, self._agreement(together, see, show), 0)
         if surface > 0:
             score *= _surface_factor(borders, first, second) ** surface
-        return _Pairs(first, second, score)
+        agree = score > level
+        return _Pairs(first[agree], second[agree], score[agree])
 
     def _agreement(self, together: np.ndarray, see: np.ndarray, show: np.ndarray) -> np.ndarray:
         doubt = self.settings.doubt
@@ -289,12 +285,8 @@ class _Votes(NamedTuple):
 
     def _views_of_both(self, first: np.ndarray, second: np.ndarray) -> np.ndarray:
         """Count, for pairs of clusters, the views that see both, and those that show each of them whole, (2, P)."""
-        count = np.empty((2, len(first)))
-        for k in range(0, len(first), _PAIRS):
-            part = slice(k, k + _PAIRS)
-            for row, votes in zip(count, (self.counts, self.shown), strict=True):
-                row[part] = np.einsum("pv,pv->p", votes[first[part]], votes[second[part]])
-        return count
+        first, second = first.astype(np.int64), second.astype(np.int64)
+        return np.stack([dots_of_pairs(first, second, votes) for votes in (self.counts, self.shown)])
 
 
 def _surface_factor(borders: Borders, first: np.ndarray, second: np.ndarray) -> np.ndarray:  # (P,), (P,)
@@ -311,20 +303,15 @@ def _in_parts(doubted: float) -> float:
     return min(doubted / _SPLIT, 1)
 
 
-def _same_view(overlap: sparse.csr_matrix, view: np.ndarray) -> sparse.csr_matrix:
-    """Pairs of segments of one view that share a Gaussian, and so touch, (n, n) of ones."""
-    entries = overlap.tocoo()
-    same = view[entries.row] == view[entries.col]
-    ones = np.ones(int(same.sum()), np.float32)
-    return sparse.csr_matrix((ones, (entries.row[same], entries.col[same])), shape=overlap.shape)
+def _touching(stack: Stack, clusters: _Clusters) -> sparse.csr_matrix:
+    """Count for pairs of clusters, (C, C), those of their segments that touch in a view."""
+    groups, nodes = grouping(clusters.of), np.flatnonzero(~stack.background)
+    return (groups @ stack.touching()[nodes][:, nodes] @ groups.T).tocsr()
 
 
-def _match(pairs: _Pairs, num: int, least: float) -> np.ndarray | None:
-    """Pair off clusters, best pairs first, each at most once; return whom each one becomes, None if nobody pairs."""
-    good = pairs.score > least
-    if not good.any():
-        return None
-    good &= pairs.score >= _BEST * pairs.score.max()
+def _match(pairs: _Pairs, num: int) -> np.ndarray:
+    """Pair off clusters, best pairs first, each at most once; return whom each one becomes, (C,)."""
+    good = pairs.score >= _BEST * pairs.score.max()
     first, second, score = pairs.first[good], pairs.second[good], pairs.score[good]
     target, free = np.arange(num), np.ones(num, bool)
     for k in np.lexsort([second, first, -score]):
@@ -335,18 +322,16 @@ def _match(pairs: _Pairs, num: int, least: float) -> np.ndarray | None:
     return target
 
 
-def _move(stack: _Stack, objects: np.ndarray, settings: AssociationSettings) -> np.ndarray:
+def _move(stack: Stack, objects: np.ndarray, settings: AssociationSettings) -> np.ndarray:
     """Give every segment to the object that explains it best by what the other views say.
 
     That ends when none moves any more, or when some do nothing but change places with each other.
     """
     parts = [slice(*bounds) for bounds in itertools.pairwise(stack.starts.tolist())]
-    before = objects
+    before, weights = objects, stack.weights().T.astype(np.float64).tocsr()
     for _ in range(settings.rounds):
         earlier, before, objects = before, objects, objects.copy()
-        profiles = Profiles.empty(stack.num_gaussians)
-        for view, rows in zip(stack.views, parts, strict=True):
-            profiles.add(view, before[rows])
+        profiles = Profiles((weights @ grouping(before).T).tocsr())
         for view, rows in zip(stack.views, parts, strict=True):
             best, seen = profiles.explain(view, before[rows])
             moves = ~stack.background[rows] & (seen >= settings.unseen)
@@ -356,7 +341,7 @@ def _move(stack: _Stack, objects: np.ndarray, settings: AssociationSettings) -> 
     return objects
 
 
-def _by_size(objects: np.ndarray, stack: _Stack) -> np.ndarray:
+def _by_size(objects: np.ndarray, stack: Stack) -> np.ndarray:
     """Give objects numbers from 1 on, the largest first."""
     size = np.bincount(objects, stack.size)
     present = np.unique(objects[objects > 0])

@@ -9,6 +9,7 @@ from scipy import sparse
 
 from gsseg_core.csr_rows import starts
 from gsseg_core.metrics import iou
+from gsseg_core.objects.association_kernels import add_common, take_away
 from gsseg_core.objects.depth_edges import Borders, borders, depth_edges
 from gsseg_core.objects.heaviest import heaviest
 from gsseg_core.raster.observation import LabelWeights, Observation
@@ -108,14 +109,10 @@ class Profiles:
 
         With `objects`, (L,), which these segments have been added as, only what the other views say counts.
         """
-        profile = self.weights[segments.gaussians]
-        if objects is not None:
-            profile = (profile - _by_object(segments, objects, profile.shape[1])).tocsr()
-            # Where this view was the only one, rounding is left.
-            profile.data[profile.data < 1e-6] = 0
-        total = sums(profile, 1)
-        profile.data /= np.repeat(np.where(total > 0, total, 1), np.diff(profile.indptr))
-        return (segments.weights @ profile).toarray(), segments.weights @ (total > 0).astype(np.float64)
+        present, common, known = self._common(segments, objects)
+        every = np.zeros((len(segments), self.weights.shape[1]))
+        every[:, present] = common
+        return every, known
 
     def explain(self, segments: Lifted, objects: np.ndarray | None = None) -> tuple[np.ndarray, np.ndarray]:
         """Find the object of the largest IoU with each segment of a view, (L,), 0 where there is none.
@@ -123,10 +120,28 @@ class Profiles:
         Also returns the share of each segment that lies on Gaussians of which anything is known, (L,). Takes what
         `common` takes.
         """
-        common, known = self.common(segments, objects)
+        present, common, known = self._common(segments, objects)
         overlap = np.nan_to_num(iou(common, known[:, None], common.sum(axis=0)))
         whole = sums(segments.weights, 1)
-        return overlap.argmax(axis=1), np.divide(known, whole, out=np.zeros_like(known), where=whole > 0)
+        best = np.where(overlap.any(axis=1), present[overlap.argmax(axis=1)], 0)
+        return best, np.divide(known, whole, out=np.zeros_like(known), where=whole > 0)
+
+    def _common(self, segments: Lifted, objects: np.ndarray | None) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Find which objects are on the Gaussians of the segments, (U,) with 0, and `common` of these, (L, U)."""
+        profile = self.weights[segments.gaussians].astype(np.float64, copy=False)
+        if objects is not None:
+            own = segments.weights.T.tocsr()
+            of_own = objects.astype(np.int64, copy=False)[own.indices]
+            take_away(profile.indptr, profile.indices, profile.data, own.indptr, of_own, own.data)
+        there = np.zeros(profile.shape[1], bool)
+        there[0], there[profile.indices] = True, True
+        common = np.zeros((len(segments), np.count_nonzero(there)))
+        known, column, weights = np.zeros(len(segments)), np.cumsum(there) - 1, segments.weights
+        add_common(
+            weights.indptr, weights.indices, weights.data, profile.indptr, column[profile.indices], profile.data,
+            sums(profile, 1), common, known,
+        )  # fmt: skip
+        return np.flatnonzero(there), common, known
 
 
 def _heaviest(segments: np.ndarray, weights: np.ndarray, size: np.ndarray, kept: float) -> np.ndarray:

@@ -10,7 +10,7 @@ import bench_ids
 import numpy as np
 import pytest
 from matching import Contingency, renamed
-from per_view_ids import agreement, in_halves, shuffled, with_labels
+from per_view_ids import agreement, in_halves, row_of_objects, shuffled, with_labels
 from scipy import sparse
 from small_scenes import (
     NAMES,
@@ -31,7 +31,6 @@ from gsseg_core.data.view import View
 from gsseg_core.errors import SceneValueError, SettingsError
 from gsseg_core.learn.em.em_learner import EMLearner
 from gsseg_core.objects.association import AssociationSettings, associate
-from gsseg_core.objects.depth_edges import Borders
 from gsseg_core.objects.lifted_segments import Lifted
 from gsseg_core.objects.object_table import ObjectTable, find_objects
 from gsseg_core.raster.backends import make_operator
@@ -162,31 +161,6 @@ def test_there_can_be_more_than_255_objects() -> None:
     table = find_objects(scene, views)
     assert table.num_objects == 299
     assert agreement(table, [View.from_arrays(c, true_labels(scene, truth, c)) for c in cameras]) > 0.99
-
-
-def row_of_objects(rng: np.random.Generator, split: float, merged: float) -> Lifted:
-    """A view of 16 objects, 20 Gaussians each, as a generator masks them, with Gaussians that reach over edges.
-
-    It cuts an object in two somewhere, and gives two neighbours one id, each with a probability. Borders are 20 px
-    long; between objects nearly all of it is a depth edge, inside of one less than half.
-    """
-    owner = np.repeat(np.arange(16), 20)
-    cut = np.where(rng.random(16) < split, rng.integers(3, 18, 16), 20)
-    ids = np.arange(16)
-    for k in range(15):
-        if rng.random() < merged:
-            ids[k + 1] = ids[k]
-    segment = np.unique(2 * ids[owner] + (np.arange(320) % 20 >= cut[owner]), return_inverse=True)[1]
-    weights = np.zeros((segment.max() + 1, 320), np.float32)
-    weights[segment, np.arange(320)] = 10 + rng.random(320)
-    last = np.flatnonzero(np.diff(segment))
-    weights[segment[last + 1], last] += 4
-    length, edges = np.zeros((2, len(weights), len(weights)), np.float32)
-    for a, b in (last, last + 1), (last + 1, last):
-        length[segment[a], segment[b]] = 20
-        edges[segment[a], segment[b]] = np.where(owner[a] == owner[b], 8, 18)
-    borders = Borders(*map(sparse.csr_matrix, (length, edges)))
-    return Lifted(np.arange(1, len(weights) + 1), np.arange(320), sparse.csr_matrix(weights), borders)
 
 
 @pytest.mark.parametrize(("split", "merged"), [(0.0, 0.0), (0.8, 0.0), (0.0, 0.25), (0.5, 0.1)])

@@ -1,0 +1,80 @@
+"""The segments of all views together: what any two of them have in common on the Gaussians."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+from scipy import sparse
+
+from gsseg_core.objects.depth_edges import Borders
+from gsseg_core.objects.lifted_segments import Lifted, sums
+from gsseg_core.objects.sparse_products import product_above
+
+_LEAST = 0.01  # of what a view sees of a segment: what has no larger a share in common with it is taken for nothing
+
+
+class Stack:
+    """The n segments of all views, stacked; Gaussians that no view sees take no part."""
+
+    def __init__(self, views: list[Lifted]) -> None:
+        self.starts = np.concatenate([[0], np.cumsum([len(view) for view in views])])
+        self.view = np.repeat(np.arange(len(views)), np.diff(self.starts))
+        self.background = np.concatenate([view.ids for view in views]) == 0
+        self.size = np.concatenate([sums(view.weights, 1) for view in views])
+        present, where = np.unique(np.concatenate([view.gaussians for view in views]), return_inverse=True)
+        numbers = np.split(where, np.cumsum([len(view.gaussians) for view in views])[:-1])
+        self.views = [replace(view, gaussians=ids) for view, ids in zip(views, numbers, strict=True)]
+        self.num_gaussians = len(present)
+
+    def weights(self) -> sparse.csr_matrix:
+        """Weights of the segments on the Gaussians, (n, I) float32, in px."""
+        return self._stacked([view.weights.data for view in self.views])
+
+    def borders(self) -> Borders:
+        """Borders between the segments of each view."""
+        parts = zip(*(view.borders or Borders.empty(len(view)) for view in self.views), strict=True)
+        return Borders(*(sparse.block_diag(part, format="csr") for part in parts))
+
+    def touching(self) -> sparse.csr_matrix:
+        """Pairs of segments of one view that share a Gaussian, (n, n) of ones."""
+        touching = sparse.block_diag([view.weights @ view.weights.T for view in self.views], format="csr")
+        touching.data[:] = 1
+        return touching
+
+    def overlaps(self) -> tuple[sparse.csr_matrix, np.ndarray, np.ndarray]:
+        """Overlaps of the A segments that are no background, by the formulas at the top of `association`.
+
+        Returns
+        -------
+        overlap : (A, n) float32
+            O; zero with background, and where it is next to nothing of what the other's view sees.
+        seen, hidden : (A, views) float32
+            V; and how much of that the view calls background.
+        """
+        roots = [np.sqrt(sums(view.weights, 0)).astype(np.float32) for view in self.views]
+        scaled = [view.weights.data / root[view.weights.indices] for view, root in zip(self.views, roots, strict=True)]
+        stacked, behind = self._stacked(scaled), np.flatnonzero(self.background)
+        where = np.concatenate([view.gaussians for view in self.views])
+        ends = np.cumsum([0, *(len(root) for root in roots)])
+        each = sparse.csr_matrix((np.concatenate(roots), where, ends), shape=(len(roots), self.num_gaussians))
+        objects = stacked[~self.background]
+        seen = (objects @ each.T).toarray()
+        hidden = np.zeros_like(seen)
+        hidden[:, self.view[behind]] = (objects @ stacked[behind].T).toarray()
+        stacked.data[np.repeat(self.background, np.diff(stacked.indptr))] = 0
+        return product_above(objects, stacked.T.tocsr(), _LEAST * seen, self.view), seen, hidden
+
+    def _stacked(self, data: list[np.ndarray]) -> sparse.csr_matrix:
+        """Stack what stands where the weights of each view do, (n, I)."""
+        rows = []
+        for view, entries in zip(self.views, data, strict=True):
+            at = view.gaussians[view.weights.indices], view.weights.indptr
+            rows.append(sparse.csr_matrix((entries, *at), shape=(len(view), self.num_gaussians)))
+        return sparse.vstack(rows, format="csr")
+
+
+def grouping(number: np.ndarray) -> sparse.csr_matrix:  # (n,)
+    """Ones that add up the rows of each group, (groups, n) float32."""
+    shape = int(number.max(initial=-1)) + 1, len(number)
+    return sparse.csr_matrix((np.ones(len(number), np.float32), (number, np.arange(len(number)))), shape=shape)

@@ -1,0 +1,134 @@
+"""Association by sparse products and only where something has changed, beside a dense twin that does all again."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from per_view_ids import row_of_objects
+from scipy import sparse
+
+from gsseg_core.objects import association
+from gsseg_core.objects.association import AssociationSettings
+from gsseg_core.objects.lifted_segments import Lifted, Profiles
+from gsseg_core.objects.sparse_products import product_above
+from gsseg_core.objects.stacked_segments import Stack
+
+SETTINGS = AssociationSettings()
+
+
+def drawn_views(seed: int, num: int, background: bool) -> list[Lifted]:
+    """Views of a row of objects, cut up and merged; with background, the first segment of each view is that."""
+    rng = np.random.default_rng(seed)
+    views = [row_of_objects(rng, 0.4, 0.15) for _ in range(num)]
+    return [replace(view, ids=np.arange(len(view))) for view in views] if background else views
+
+
+@settings(max_examples=40)
+@given(st.integers(0, 2**32 - 1), st.integers(0, 12), st.integers(1, 9), st.integers(1, 40), st.floats(0, 2))
+def test_what_is_large_in_a_product_is_kept_and_nothing_else(
+    seed: int, rows: int, inner: int, columns: int, least: float
+) -> None:
+    rng = np.random.default_rng(seed)
+    left, right = (
+        np.where(rng.random(shape) < 0.4, rng.integers(1, 4, shape), 0).astype(np.float32)
+        for shape in ((rows, inner), (inner, columns))
+    )
+    group, bars = rng.integers(0, 3, columns), (least * rng.random((rows, 3))).astype(np.float32)
+    found = product_above(sparse.csr_matrix(left), sparse.csr_matrix(right), bars, group)
+    whole = left @ right
+    np.testing.assert_array_equal(found.toarray(), np.where(whole > bars[:, group], whole, 0))
+    assert found.dtype == np.float32 and found.nnz == np.count_nonzero(whole > bars[:, group])
+
+
+def test_a_product_does_not_depend_on_how_many_rows_there_is_room_for(monkeypatch: pytest.MonkeyPatch) -> None:
+    stack = Stack(drawn_views(0, 6, True))
+    at_once = stack.overlaps()[0]
+    monkeypatch.setattr("gsseg_core.objects.sparse_products._SCRATCH", 700)
+    in_parts = stack.overlaps()[0]
+    for name in ("data", "indices", "indptr"):
+        np.testing.assert_array_equal(getattr(at_once, name), getattr(in_parts, name))
+
+
+@pytest.mark.parametrize("background", [False, True])
+def test_overlaps_are_those_of_the_formulas(background: bool) -> None:
+    views = drawn_views(1, 5, background)
+    stack = Stack(views)
+    weights = np.concatenate([view.weights.toarray() for view in views]).astype(np.float64)  # (n, I)
+    sums = np.stack([view.weights.toarray().sum(axis=0) for view in views]).astype(np.float64)  # s, (views, I)
+    scaled = weights / np.sqrt(sums)[stack.view]
+    overlap, seen = scaled @ scaled.T, scaled @ np.sqrt(sums).T
+    hidden = np.zeros_like(seen)
+    hidden[:, stack.view[stack.background]] = overlap[:, stack.background]
+    small = overlap <= 0.01 * seen[:, stack.view]
+    expected = np.where(small | stack.background, 0, overlap), seen, hidden
+    assert small.any()
+    for found, right in zip(stack.overlaps(), expected, strict=True):
+        found = found.toarray() if sparse.issparse(found) else found
+        np.testing.assert_allclose(found, right[~stack.background], rtol=1e-5, atol=1e-5)
+
+
+def merged_by_comparing_all_anew(
+    clusters: association._Clusters, votes: association._Votes, view: np.ndarray, level: float, surface: float
+) -> tuple[association._Clusters, association._Votes]:
+    """The twin of `_merged`."""
+    while True:
+        every = np.arange(len(clusters.seen))
+        votes = association._Votes.of(clusters, every, view, SETTINGS)
+        pairs = votes.pairs(every, clusters.borders, surface, level)
+        if not len(pairs.first):
+            return clusters, votes
+        number = np.unique(association._match(pairs, len(every)), return_inverse=True)[1]
+        clusters = clusters.merged(number)
+
+
+@pytest.mark.parametrize("seed", range(4))
+@pytest.mark.parametrize("surface", [0.0, 0.6])
+def test_comparing_only_what_has_merged_gives_what_comparing_all_gives(seed: int, surface: float) -> None:
+    stack = Stack(drawn_views(seed, 9, seed % 2 == 0))
+    start = association._Clusters.single(stack)
+    votes = association._Votes.of(start, np.arange(len(start.seen)), stack.view, SETTINGS)
+    for level in (0.6, 0.3):
+        found, found_votes = association._merged(start, votes, stack.view, level, surface)
+        twin, twin_votes = merged_by_comparing_all_anew(start, votes, stack.view, level, surface)
+        assert found.of.max() < start.of.max()
+        np.testing.assert_array_equal(found.of, twin.of)
+        for name in ("counts", "shown"):
+            np.testing.assert_array_equal(getattr(found_votes, name), getattr(twin_votes, name))
+        np.testing.assert_array_equal(found_votes.whole.toarray(), twin_votes.whole.toarray())
+        start, votes = found, found_votes
+
+
+def explained_densely(profile: np.ndarray, view: Lifted, objects: np.ndarray | None) -> tuple[np.ndarray, np.ndarray]:
+    """The twin of `Profiles.common`, by the weights (N, K) of the objects."""
+    weights, rest = view.weights.toarray().astype(np.float64), profile[view.gaussians].copy()
+    if objects is not None:
+        for a, k in enumerate(objects):
+            rest[:, k] -= weights[a]
+        rest[rest < 1e-6] = 0
+    total = rest.sum(axis=1, keepdims=True)
+    return weights @ np.divide(rest, total, out=np.zeros_like(rest), where=total > 0), weights @ (total[:, 0] > 0)
+
+
+@pytest.mark.parametrize("left_out", [False, True])
+def test_what_segments_have_in_common_with_objects_is_that_of_the_definition(left_out: bool) -> None:
+    rng = np.random.default_rng(0)
+    views = drawn_views(2, 5, True)
+    objects = [rng.integers(0, 12, len(view)) for view in views]
+    profiles, dense = Profiles.empty(330), np.zeros((330, 12))  # Ten Gaussians more than any view sees.
+    for view, numbers in zip(views[1:], objects[1:], strict=True):
+        profiles.add(view, numbers)
+        for a, k in enumerate(numbers):
+            dense[view.gaussians, k] += view.weights[a].toarray().ravel()
+    view, own = (views[1], objects[1]) if left_out else (views[0], None)
+    found, expected = profiles.common(view, own), explained_densely(dense, view, own)
+    for one, other in zip(found, expected, strict=True):
+        np.testing.assert_allclose(one, other, rtol=1e-9, atol=1e-9)
+    best, seen = profiles.explain(view, own)
+    common, known = expected
+    iou = common / np.maximum(known[:, None] + common.sum(axis=0) - common, 1e-12)
+    np.testing.assert_array_equal(best, iou.argmax(axis=1))
+    np.testing.assert_allclose(seen, known / view.weights.toarray().sum(axis=1), rtol=1e-6)
