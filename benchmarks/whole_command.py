@@ -5,6 +5,7 @@
     python benchmarks/whole_command.py --workload e               # 3 M Gaussians indoors, 60 views: 1 GiB of disk
     python benchmarks/whole_command.py --workload c               # 3 M Gaussians, 200 views: 8 GiB of disk
     python benchmarks/whole_command.py --workload c --share 0.1   # a tenth of its Gaussians, views and pixels
+    python benchmarks/whole_command.py --labels labels_automatic  # hundreds of things, ids of each view's own
 
 Seconds are medians over the runs, of the wall clock and of all cores; ratios are of this one run of the program. The
 bar is the whole command over what it learns in (observe and learn). Wrong masks are used unless `--labels labels`.
@@ -28,6 +29,7 @@ from typing import Any
 
 REPOSITORY = Path(__file__).resolve().parents[1]
 LEARNING = ("observe", "learn")
+AUTOMATIC = "labels_automatic"
 
 
 def main() -> int:
@@ -46,7 +48,9 @@ def main() -> int:
         print(json.dumps(run_here(options.data, options.labels, options.device, options.child)))
         return 0
     with tempfile.TemporaryDirectory() as work:
-        folder = options.data or write_workload(Path(work) / "data", options.workload, options.share)
+        folder = options.data or write_workload(
+            Path(work) / "data", options.workload, options.share, options.labels == AUTOMATIC
+        )
         answers: list[list[dict[str, Any]]] = [[] for _ in options.trees]
         for _ in range(options.runs):
             for tree, answer in zip(options.trees, answers, strict=True):
@@ -56,7 +60,7 @@ def main() -> int:
     return 0
 
 
-def write_workload(folder: Path, name: str, share: float) -> Path:
+def write_workload(folder: Path, name: str, share: float, automatic: bool) -> Path:
     """Write a workload, or a part of it, as a dataset."""
     from workloads import WHOLE, write_room
 
@@ -66,7 +70,7 @@ def write_workload(folder: Path, name: str, share: float) -> Path:
         width=round(share**0.5 * size.width), height=round(share**0.5 * size.height), tests=min(size.tests, 1),
     )  # fmt: skip
     print(part if share < 1 else size, file=sys.stderr, flush=True)
-    return write_room(folder, part if share < 1 else size, wrong=True)
+    return write_room(folder, part if share < 1 else size, wrong=not automatic, automatic=automatic)
 
 
 def run_in(tree: Path, folder: Path, labels: str, device: str, out: Path) -> dict[str, Any]:
@@ -104,7 +108,8 @@ def run_here(folder: Path, labels: str, device: str, out: str) -> dict[str, Any]
 
     keep_freed_memory()
     warm_up(device)
-    report = pipeline.segment(folder / "scene.ply", folder, out, labels=labels, device=device)
+    ids = "per-view" if labels == AUTOMATIC else None
+    report = pipeline.segment(folder / "scene.ply", folder, out, labels=labels, device=device, ids=ids)
     return {"wall": wall, "cores": cores, "peak": peak_memory(), "steps": len(report["objective"])}
 
 

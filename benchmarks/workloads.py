@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from automatic_masks import AutomaticMasks
 from garden import build_garden
 from room import Room, build_room
 
@@ -151,8 +152,10 @@ WHOLE = {
 """Workloads of the whole command: (c) is what people capture outdoors, (d) the largest of it, (e) a large room."""
 
 
-def write_room(folder: Path, size: RoomSize, *, wrong: bool = False, seed: int = 0) -> Path:
-    """Write a room as a dataset: scene, cameras, split and true masks, and wrong ones if asked for."""
+def write_room(
+    folder: Path, size: RoomSize, *, wrong: bool = False, automatic: bool = False, seed: int = 0
+) -> Path:  # fmt: skip
+    """Write a room as a dataset: scene, cameras, split and true masks, and wrong or automatic ones if asked for."""
     room = make_room(size, seed)
     folder.mkdir(parents=True, exist_ok=True)
     room.scene.save(folder / "scene.ply")
@@ -168,6 +171,10 @@ def write_room(folder: Path, size: RoomSize, *, wrong: bool = False, seed: int =
         write_mask(folder / "labels" / f"{camera.name}.png", labels, 8)
         if wrong:
             write_mask(folder / "labels_noisy" / f"{camera.name}.png", corrupt(labels, rng), 8)
+    if automatic:
+        masks = AutomaticMasks(room, seed)
+        for camera in room.cameras:
+            masks.write(folder / "labels_automatic", camera)
     return folder
 
 
