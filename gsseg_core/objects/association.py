@@ -7,8 +7,9 @@ of view v: all that v saw of each Gaussian. With sqrt(s_u s_v) as the weight of 
     V_av = sum_i (w_a / sqrt s_u)[i] sqrt(s_v)[i]              what v sees of a, whatever it calls it
 
 and O_ab / V_av is the share of what v sees of a that it calls b. Hidden parts do not count, so a segment that is half
-behind a chair still matches the whole. All three are products of sparse matrices, and sums over the segments of a
-cluster are those of the cluster.
+behind a chair still matches the whole. Both are products of sparse matrices, and sums over the segments of a
+cluster are those of the cluster. An O_ab of less than a hundredth of V_av is taken for nothing: a half to two thirds of
+all are, and they hardly ever make a vote together.
 
 1. **Views that show things whole vote.** A view shows cluster C whole by f_C, which grows from 0 to 1 while the largest
    share O_Cb / V_Cv of an id grows from one half to nine tenths. Of the views that see both C and D, two averages are
