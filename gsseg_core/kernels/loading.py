@@ -16,6 +16,7 @@ from numba.core.codegen import JITCodeLibrary, JITCPUCodegen
 from numba.core.dispatcher import Dispatcher
 from numba.core.environment import Environment, lookup_environment
 from numba.core.runtime.nrt import rtsys
+from numba.np.ufunc.parallel import _launch_threads
 
 from gsseg_core.kernels.parts import taken_for
 
@@ -98,6 +99,8 @@ class _KernelCache(FunctionCache):
 
     def load_overload(self, sig: Any, target_context: Any) -> Any:
         rtsys.initialize(target_context)  # All that machine code needs of what numba makes ready to compile.
+        # Of a kernel that calls one whose loops are parallel, numba may not have noted that it needs threads.
+        _launch_threads()
         return self._load_overload(sig, target_context)
 
 

@@ -94,6 +94,17 @@ def test_a_kernel_calls_another_that_is_in_the_cache(load: Callable[[], ModuleTy
     assert np.array_equal(again.outer(XS), module.outer(XS)) and again.outer.stats.cache_hits
 
 
+def test_a_program_may_begin_with_a_kernel_that_calls_a_parallel_one(tmp_path: Path) -> None:
+    caller = "\n@kernel\ndef caller(xs):\n    return outer(xs).sum()\n"
+    (tmp_path / "made_for_a_test.py").write_text(KERNELS + caller)
+    begin = f"import sys; sys.path.insert(0, {str(tmp_path)!r}); import numpy as np; import made_for_a_test as made; "
+    # Compiled while the other is in the cache, then loaded where none was before it.
+    for call in ("outer", "caller", "caller"):
+        work = f"{begin}print(np.sum(made.{call}(np.linspace(0, 1, 9))))"
+        run = subprocess.run([sys.executable, "-c", work], capture_output=True, text=True, check=True)
+        assert float(run.stdout) == pytest.approx(4.0**2 - 1.5**2)
+
+
 def test_a_kernel_that_is_loaded_reads_nothing_that_only_compiling_needs(load: Callable[[], ModuleType]) -> None:
     load().outer(XS)
     module = load()
