@@ -15,6 +15,7 @@ from scipy.spatial import cKDTree
 from gsseg_core.data.label_images import UNKNOWN, write_mask
 from gsseg_core.raster.backends import make_operator
 from gsseg_core.raster.depth import surface
+from gsseg_core.raster.view_renderer import PixelGrid
 from gsseg_core.scene.camera import Camera
 
 THINGS, PARTS = 300, 4
@@ -40,7 +41,7 @@ class AutomaticMasks:
 
     def draw(self, camera: Camera) -> np.ndarray:
         """Draw the mask of a view, (H, W) int32, 1 and up; `UNKNOWN` where there is none."""
-        depth = surface(self._scene, make_operator(self._scene, camera)).depth[::STEP, ::STEP]
+        depth = surface(self._scene, make_operator(self._scene, camera), PixelGrid(0, STEP)).depth
         known = np.isfinite(depth)
         y, x = STEP * np.indices(depth.shape) + 0.5
         z = np.where(known, depth, 0)

@@ -92,7 +92,7 @@ def write_classes(
     """
     confidence, names = segmentation.confidence, segmentation.class_names
     order = np.arange(len(scene)) if order is None else order
-    members = {k: order[ids] for k, ids in rows_by_label(segmentation.labels[order]).items() if k >= 0}
+    members = {k: order[ids] for k, ids in _members(segmentation.labels[order]).items()}
     paths = class_paths(segmentation, folder, scene_format)
     for k, mesh in meshes.items():
         mesh.save(folder / mesh_file_name(k, names[k]), run)
@@ -136,8 +136,7 @@ def write_selection(
             _remove_mesh(places[k])
         return
     labels = labels[chosen]
-    members = {k: ids for k, ids in rows_by_label(labels).items() if k >= 0}
-    objects = _objects(part, members, class_names, meshes)
+    objects = _objects(part, _members(labels), class_names, meshes)
     if (labels < 0).any():
         objects.append(SceneObject(part.subset(labels < 0)))
     write_objects(objects, path, scene_format)
@@ -151,6 +150,11 @@ def _remove_mesh(path: Path) -> None:
                 is_ours = file.readline(len(LONE)) == LONE
             if is_ours:
                 path.unlink()
+
+
+def _members(labels: np.ndarray) -> dict[int, np.ndarray]:  # (N,) int
+    """List the Gaussians of each class that has any, (M,) int64."""
+    return {k: ids for k, ids in rows_by_label(labels).items() if k >= 0}
 
 
 def _objects(

@@ -100,5 +100,4 @@ def call_all() -> None:
     pack(row, row.astype(np.int32), one, one, small, none)
     dots_of_pairs(one[:0], one[:0], row)
     take_away(indptr, none, small.astype(np.float64), indptr, one[:0], small)
-    add_common(indptr, none, small, indptr, one[:0], small.astype(np.float64), one.astype(np.float64), np.zeros((1, 1)),
-               np.zeros(1))  # fmt: skip
+    add_common(indptr, none, small, indptr, none, small.astype(np.float64), np.zeros(1), np.zeros((1, 1)), np.zeros(1))

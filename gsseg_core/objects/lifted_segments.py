@@ -42,11 +42,8 @@ class Lifted:
         shown = np.diff(start) > 0
         first[shown] = ids[start[:-1][shown]]
         order = np.lexsort([first, -size])[: np.count_nonzero(size)]
-        present = np.zeros(int(ids.max(initial=-1)) + 1, bool)
-        present[ids] = True
-        gaussians, place = np.flatnonzero(present).astype(np.int32), np.empty(len(present), np.int32)
-        place[gaussians] = np.arange(len(gaussians), dtype=np.int32)
-        by_label = sparse.csr_matrix((weights, place[ids], start), shape=(len(size), len(gaussians)))
+        gaussians, column = without_gaps(ids)
+        by_label = sparse.csr_matrix((weights, column, start), shape=(len(size), len(gaussians)))
         return cls(seen.classes[order], gaussians, by_label[order])
 
     def bordered(self, scene: GaussianScene, operator: ViewOperator, labels: np.ndarray) -> Lifted:
@@ -133,15 +130,25 @@ class Profiles:
             own = segments.weights.T.tocsr()
             of_own = objects.astype(np.int64, copy=False)[own.indices]
             take_away(profile.indptr, profile.indices, profile.data, own.indptr, of_own, own.data)
-        there = np.zeros(profile.shape[1], bool)
-        there[0], there[profile.indices] = True, True
-        common = np.zeros((len(segments), np.count_nonzero(there)))
-        known, column, weights = np.zeros(len(segments)), np.cumsum(there) - 1, segments.weights
+        present, column = without_gaps(np.append(profile.indices, 0))
+        common, known, weights = np.zeros((len(segments), len(present))), np.zeros(len(segments)), segments.weights
         add_common(
-            weights.indptr, weights.indices, weights.data, profile.indptr, column[profile.indices], profile.data,
-            sums(profile, 1), common, known,
+            weights.indptr, weights.indices, weights.data, profile.indptr, column[:-1], profile.data, sums(profile, 1),
+            common, known,
         )  # fmt: skip
-        return np.flatnonzero(there), common, known
+        return present, common, known
+
+
+def without_gaps(numbers: np.ndarray) -> tuple[np.ndarray, np.ndarray]:  # (P,), at least 0
+    """Find which numbers occur, (U,) int32 ascending, and give each its place among these, (P,) int32.
+
+    It is `np.unique` with the inverse, without sorting: for numbers that are not much larger than there are many.
+    """
+    place = np.zeros(int(numbers.max(initial=-1)) + 1, np.int32)
+    place[numbers] = 1
+    present = np.flatnonzero(place).astype(np.int32)
+    place[present] = np.arange(len(present), dtype=np.int32)
+    return present, place[numbers]
 
 
 def _heaviest(segments: np.ndarray, weights: np.ndarray, size: np.ndarray, kept: float) -> np.ndarray:

@@ -8,7 +8,7 @@ import numpy as np
 from scipy import sparse
 
 from gsseg_core.objects.depth_edges import Borders
-from gsseg_core.objects.lifted_segments import Lifted, sums
+from gsseg_core.objects.lifted_segments import Lifted, sums, without_gaps
 from gsseg_core.objects.sparse_products import product_above
 
 _LEAST = 0.01  # of what a view sees of a segment: what has no larger a share in common with it is taken for nothing
@@ -22,7 +22,7 @@ class Stack:
         self.view = np.repeat(np.arange(len(views)), np.diff(self.starts))
         self.background = np.concatenate([view.ids for view in views]) == 0
         self.size = np.concatenate([sums(view.weights, 1) for view in views])
-        present, where = np.unique(np.concatenate([view.gaussians for view in views]), return_inverse=True)
+        present, where = without_gaps(np.concatenate([view.gaussians for view in views]))
         numbers = np.split(where, np.cumsum([len(view.gaussians) for view in views])[:-1])
         self.views = [replace(view, gaussians=ids) for view, ids in zip(views, numbers, strict=True)]
         self.num_gaussians = len(present)

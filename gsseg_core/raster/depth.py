@@ -9,7 +9,7 @@ import numpy as np
 
 from gsseg_core.kernels.compiler import kernel
 from gsseg_core.raster.view_operator import ViewOperator
-from gsseg_core.raster.view_renderer import Blended, PixelGrid
+from gsseg_core.raster.view_renderer import EVERY_PIXEL, Blended, PixelGrid
 from gsseg_core.scene.camera import Camera
 from gsseg_core.scene.gaussian_scene import GaussianScene
 
@@ -25,10 +25,9 @@ class Surface(NamedTuple):
     depth: np.ndarray  # (H, W) float32: mean depth by weight, scene units; infinite where there is nothing
 
 
-def surface(scene: GaussianScene, operator: ViewOperator, grid: PixelGrid | None = None) -> Surface:
+def surface(scene: GaussianScene, operator: ViewOperator, grid: PixelGrid = EVERY_PIXEL) -> Surface:
     """Render coverage and depth of a scene, or of an object alone, by the operator of a view; or on a grid of it."""
-    codes = depths(scene, operator.camera, operator.ids)[:, None]
-    image, left_over = operator.blend_seen(codes) if grid is None else operator.blend_grid(codes, grid)
+    image, left_over = operator.blend_grid(depths(scene, operator.camera, operator.ids)[:, None], grid)
     return surface_of(image[..., 0], left_over)
 
 

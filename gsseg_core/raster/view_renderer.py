@@ -34,6 +34,7 @@ class PixelGrid(NamedTuple):
         return image[self.first :: self.step, self.first :: self.step]
 
 
+EVERY_PIXEL = PixelGrid(0, 1)
 NO_PIXELS = PixelGrid(1 << 30, 1 << 30)  # of which no image has one
 
 

@@ -8,7 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from small_scenes import balls_on_a_table, clean_views
 
-from gsseg_core.objects.lifted_segments import Lifted
+from gsseg_core.objects.lifted_segments import Lifted, without_gaps
 from gsseg_core.raster.backends import make_operator
 from gsseg_core.raster.observation import LabelWeights
 
@@ -76,3 +76,11 @@ def test_a_view_is_lifted_alike_by_its_observation_its_weights_and_any_number_of
             np.testing.assert_array_equal(getattr(other, name), getattr(found[0], name))
         for name in ("data", "indices", "indptr"):
             np.testing.assert_array_equal(getattr(other.weights, name), getattr(found[0].weights, name))
+
+
+@given(st.lists(st.integers(0, 60)))
+def test_numbers_get_places_without_gaps_as_unique_gives_them(numbers: list[int]) -> None:
+    array = np.array(numbers, np.int64)
+    for found, expected in zip(without_gaps(array), np.unique(array, return_inverse=True), strict=True):
+        assert found.dtype == np.int32
+        np.testing.assert_array_equal(found, expected)
