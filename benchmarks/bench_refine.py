@@ -23,7 +23,8 @@ import numba as nb
 import numpy as np
 from scipy.spatial import cKDTree
 
-from gsseg_core.refine.knn_filter import cluster_in_place, statistical_filter
+from gsseg_core.csr_rows import CSRRows
+from gsseg_core.refine.knn_filter import cluster, statistical_filter
 from gsseg_core.refine.settings import RefineSettings
 from gsseg_core.scene.gaussian_scene import GaussianScene
 from gsseg_core.spatial.neighbourhood import Neighbours
@@ -43,12 +44,13 @@ def main() -> None:
     means = GaussianScene.load(path).means
     labels, probabilities, observed = make_codes(means)
     k, beta = RefineSettings.k, RefineSettings.beta
-    unsure = cluster_in_place(means, probabilities.copy(), observed, k, beta)[0].mean()
+    rows = CSRRows.from_dense(np.where(observed[:, None], probabilities, np.float32(0)))
+    unsure = cluster(means, rows, CLASSES, k, beta)[1].mean()
 
     print(f"{processor()}, {nb.get_num_threads()} threads, load {load()} before, numba {nb.__version__}")
     print(f"{len(means)} Gaussians, {CLASSES} classes, {unsure:.1%} unsure or unobserved, k = {k}, {REPEATS} runs\n")
     steps = {
-        "cluster": lambda: cluster_in_place(means, probabilities.copy(), observed, k, beta),
+        "cluster": lambda: cluster(means, rows, CLASSES, k, beta),
         "filter": lambda: statistical_filter(means, labels, k, 1.0, CLASSES),
     }
     steps["cluster + filter"] = lambda: (steps["cluster"](), steps["filter"]())

@@ -133,7 +133,7 @@ def _held_out(learner: Learner, name: str, views: Sequence[View]) -> Iterator[Sa
         if checker is not None:
             yield checker.sample(view)
             continue
-        codes = learner.vote_codes_without(view.name)
+        codes = learner.vote_rows_without(view.name).dense(learner.num_classes)
         codes = hard_votes(codes, 0.0) if name == HARD else codes
         image, left_over = make_operator(learner.scene, view.camera).blend(codes)
         image[..., 0] += left_over * bool(codes[:, 0].any())

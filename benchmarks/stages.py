@@ -11,6 +11,7 @@ from pathlib import Path
 import numpy as np
 from machine import asked_anew, drop_from_page_cache, once, timed
 
+from gsseg_core.data.class_names import class_name
 from gsseg_core.data.dataset import Dataset
 from gsseg_core.data.view import View, spread
 from gsseg_core.export.class_files import export_classes
@@ -23,7 +24,7 @@ from gsseg_core.raster.cpu.depth_sort import sort_by_depth
 from gsseg_core.raster.cpu.projection import project
 from gsseg_core.raster.cpu.tiling import assign
 from gsseg_core.raster.depth import depths
-from gsseg_core.refine.knn_filter import cluster_in_place, statistical_filter
+from gsseg_core.refine.knn_filter import cluster, statistical_filter
 from gsseg_core.refine.settings import RefineSettings
 from gsseg_core.scene.gaussian_scene import GaussianScene
 from gsseg_core.segmentation import Segmentation
@@ -130,13 +131,13 @@ def _refinement(path: Path, data: Dataset, runs: int) -> Times:
     learner = VoteLearner(scene, data.num_classes)
     for view in data.views("train"):
         learner.observe(view)
-    codes = learner.fit().codes_
-    observed, evidence, names = learner.observed_, learner.evidence(), data.class_names
+    rows = learner.fit().code_rows_
+    evidence, names = learner.evidence(), {k: class_name(data.class_names, k) for k in range(data.num_classes)}
     # The first call on a scene finds the neighbours; the later ones have them.
     fresh = [GaussianScene.load(path) for _ in range(runs)]
 
     def refine(scene: GaussianScene) -> Segmentation:
-        return Segmentation.from_codes(scene, codes, names, evidence=evidence)
+        return Segmentation.refined(scene, rows, names, settings, evidence)
 
     times["segment, first call"] = [once(lambda s=s: refine(s)) for s in fresh]
     del fresh
@@ -145,7 +146,7 @@ def _refinement(path: Path, data: Dataset, runs: int) -> Times:
     known = Neighbours.among(scene.means, settings.k).look_for()
     times["neighbours"] = timed(lambda: Neighbours.among(scene.means, settings.k).look_for(), runs)
     times["KNN"] = timed(
-        lambda: cluster_in_place(scene.means, codes.copy(), observed, settings.k, settings.beta, known, evidence), runs
+        lambda: cluster(scene.means, rows, data.num_classes, settings.k, settings.beta, known, evidence), runs
     )
     times["filter"] = timed(
         lambda: statistical_filter(

@@ -2,16 +2,18 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from typing import NamedTuple
 
 import numba as nb
 import numpy as np
+import numpy.typing as npt
 
 from gsseg_core.kernels.compiler import kernel
 from gsseg_core.simd import AHEAD, prefetch
 
 _NONE = np.uint32(2**32 - 1)
+_AT_A_TIME = 1 << 22  # entries, zeros among them, of rows that are written out in full at a time
 
 
 class CSRRows(NamedTuple):
@@ -33,11 +35,21 @@ class CSRRows(NamedTuple):
         return rows
 
     @classmethod
+    def empty(cls, num_rows: int, dtype: npt.DTypeLike = np.float32) -> CSRRows:
+        """Make rows without entries."""
+        return cls(np.zeros(num_rows + 1, np.int64), np.empty(0, np.uint32), np.empty(0, dtype))
+
+    @classmethod
     def vstack(cls, parts: Sequence[CSRRows]) -> CSRRows:  # at least one
         """Stack rows below each other."""
         indptrs, indices, data = zip(*parts, strict=True)
         lengths = np.concatenate([np.diff(indptr) for indptr in indptrs])
         return cls(starts(lengths), np.concatenate(indices), np.concatenate(data))
+
+    @property
+    def num_rows(self) -> int:
+        """N."""
+        return len(self.indptr) - 1
 
     def with_data(self, data: np.ndarray) -> CSRRows:
         """Replace the entries and keep where they stand."""
@@ -45,8 +57,16 @@ class CSRRows(NamedTuple):
 
     def dense(self, num_classes: int) -> np.ndarray:
         """Return the array with its zeros, (N, K)."""
-        out = np.zeros((len(self.indptr) - 1, num_classes), self.data.dtype)
-        _write(self, out)
+        return self._written(slice(0, self.num_rows), num_classes)
+
+    def blocks(self, num_classes: int) -> Iterator[np.ndarray]:
+        """Give the array with its zeros, (N, K), some rows after the other: it need not be in memory as a whole."""
+        for some in slices(self.num_rows, num_classes):
+            yield self._written(some, num_classes)
+
+    def _written(self, some: slice, num_classes: int) -> np.ndarray:
+        out = np.zeros((some.stop - some.start, num_classes), self.data.dtype)
+        _write(self._replace(indptr=self.indptr[some.start : some.stop + 1]), out)
         return out
 
     def united(self, other: CSRRows) -> tuple[CSRRows, CSRRows]:
@@ -81,11 +101,42 @@ class CSRRows(NamedTuple):
         _take(self, ids, rows)
         return rows
 
+    def replaced(self, rows: np.ndarray, others: CSRRows) -> CSRRows:  # (N,) int64
+        """Copy the array with rows of another one in place of some: `rows` says which for each, -1 for its own."""
+        lengths = np.diff(self.indptr)
+        taken = np.flatnonzero(rows >= 0)
+        lengths[taken] = np.diff(others.indptr)[rows[taken]]
+        indptr = starts(lengths)
+        made = CSRRows(indptr, np.empty(indptr[-1], np.uint32), np.empty(indptr[-1], self.data.dtype))
+        _copy_rows(self, rows, others, made)
+        return made
+
+    def only(self, kept: np.ndarray) -> CSRRows:  # (N,) bool
+        """Copy the array without the entries of some rows."""
+        return self.replaced(np.where(kept, -1, 0), CSRRows.empty(1, self.data.dtype))
+
+    def in_columns(self, columns: np.ndarray) -> CSRRows:  # (Z,) uint32
+        """Move each entry to another column of its row; those that meet in one are added up."""
+        moved = CSRRows(self.indptr, columns.astype(np.uint32), self.data.copy())
+        lengths = np.empty(self.num_rows, np.int64)
+        _sort_and_add(moved, lengths)
+        indptr = starts(lengths)
+        made = CSRRows(indptr, np.empty(indptr[-1], np.uint32), np.empty(indptr[-1], self.data.dtype))
+        _take(moved, np.arange(self.num_rows), made)
+        return made
+
     def with_rows(self, ids: np.ndarray, rows: CSRRows) -> CSRRows:  # (M,) distinct; M rows of the same pattern
         """Copy the array with other entries in some of its rows."""
         replaced = self.with_data(self.data.copy())
         _put(replaced, ids, rows)
         return replaced
+
+
+def slices(num_rows: int, num_classes: int) -> Iterator[slice]:
+    """Cut (N, K) into slices of rows of which one with all its zeros takes little memory."""
+    step = max(_AT_A_TIME // max(num_classes, 1), 1)
+    for first in range(0, num_rows, step):
+        yield slice(first, min(first + step, num_rows))
 
 
 def starts(counts: np.ndarray) -> np.ndarray:  # (n,)
@@ -94,17 +145,18 @@ def starts(counts: np.ndarray) -> np.ndarray:  # (n,)
 
 
 @kernel(parallel=True)
-def largest(array: np.ndarray) -> tuple[np.ndarray, np.ndarray]:  # (N, K) float32
+def largest(rows: CSRRows) -> tuple[np.ndarray, np.ndarray]:  # float32
     """Find the largest entry of each row, (N,) float32, and its column, (N,) int32: the first of equal ones.
 
     0 and column -1 where no entry is above 0.
     """
-    entries, columns = np.empty(array.shape[0], np.float32), np.empty(array.shape[0], np.int32)
-    for i in nb.prange(array.shape[0]):
+    indptr, indices, data = rows
+    entries, columns = np.empty(indptr.shape[0] - 1, np.float32), np.empty(indptr.shape[0] - 1, np.int32)
+    for i in nb.prange(indptr.shape[0] - 1):
         most, column = np.float32(0), np.int32(-1)
-        for k in range(array.shape[1]):
-            if array[i, k] > most:
-                most, column = array[i, k], np.int32(k)
+        for z in range(indptr[i], indptr[i + 1]):
+            if data[z] > most:
+                most, column = data[z], np.int32(indices[z])
         entries[i], columns[i] = most, column
     return entries, columns
 
@@ -165,6 +217,41 @@ def _take(rows: CSRRows, ids: np.ndarray, taken: CSRRows) -> None:
         for j in range(taken_indptr[m + 1] - taken_indptr[m]):
             z = taken_indptr[m] + j
             taken_indices[z], taken_data[z] = indices[first + j], data[first + j]
+
+
+@kernel(parallel=True)
+def _copy_rows(rows: CSRRows, which: np.ndarray, others: CSRRows, made: CSRRows) -> None:
+    indptr, indices, data = rows
+    other_indptr, other_indices, other_data = others
+    made_indptr, made_indices, made_data = made
+    for i in nb.prange(which.shape[0]):
+        first = indptr[i] if which[i] < 0 else other_indptr[which[i]]
+        for j in range(made_indptr[i + 1] - made_indptr[i]):
+            z = made_indptr[i] + j
+            if which[i] < 0:
+                made_indices[z], made_data[z] = indices[first + j], data[first + j]
+            else:
+                made_indices[z], made_data[z] = other_indices[first + j], other_data[first + j]
+
+
+@kernel(parallel=True)
+def _sort_and_add(rows: CSRRows, lengths: np.ndarray) -> None:
+    """Sort each row by column, add up what has the same, and tell how many entries are left at its beginning."""
+    indptr, indices, data = rows
+    for i in nb.prange(indptr.shape[0] - 1):
+        first, left = indptr[i], indptr[i]
+        for z in range(first, indptr[i + 1]):
+            column, entry, place = indices[z], data[z], left
+            while place > first and indices[place - 1] > column:
+                place -= 1
+            if place > first and indices[place - 1] == column:
+                data[place - 1] += entry
+                continue
+            for y in range(left, place, -1):
+                indices[y], data[y] = indices[y - 1], data[y - 1]
+            indices[place], data[place] = column, entry
+            left += 1
+        lengths[i] = left - first
 
 
 @kernel(parallel=True)

@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from gsseg_core.align.placing import Placed, place
+from gsseg_core.csr_rows import CSRRows
 from gsseg_core.data.dataset import Dataset
 from gsseg_core.data.hints import FRAME_HINT, mask_hint
 from gsseg_core.data.label_images import GLOBAL, PER_VIEW, write_mask
@@ -144,15 +145,15 @@ def segment(
             run.claim(settings.places(inputs.class_names, inputs.pictured))
             fitted = _learn(inputs, settings, client, watch, progress)
             assessment = _assess(fitted, inputs.class_names, watch, progress)
-        codes, evidence = fitted.codes_, fitted.evidence()
+        codes, evidence = fitted.code_rows_, fitted.evidence()
         spreads = settings.graph if assessment.calibration.unknown > UNKNOWN_SHARE else None
         settings = replace(settings, graph=spreads, learner_settings=getattr(fitted, "settings", None))
         del fitted  # Its votes take as much memory as all that follows.
         with watch.stage("refine"):
-            if settings.graph:
-                codes = propagate(graph_of(inputs.scene), codes, evidence)
             names = inputs.class_names
-            result = Segmentation.from_codes(inputs.scene, codes, names, settings.refine, evidence, copy=False)
+            if settings.graph:
+                codes = CSRRows.from_dense(propagate(graph_of(inputs.scene), codes.dense(len(names)), evidence))
+            result = Segmentation.refined(inputs.scene, codes, names, settings.refine, evidence)
             del codes
         drawn: dict[str, Drawn] = {}
         if settings.refine.carve:

@@ -8,7 +8,7 @@ from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property, partial
 from pathlib import Path
-from typing import NamedTuple, TypeVar
+from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
 
@@ -20,6 +20,7 @@ from gsseg_core.errors import SettingsError, StateMismatchError
 from gsseg_core.files.limits import MAX_LABEL
 from gsseg_core.files.npz_files import (
     UnfitError,
+    WithZeros,
     check_evidence,
     check_shares,
     check_temperature,
@@ -29,16 +30,16 @@ from gsseg_core.files.npz_files import (
     write_npz,
 )
 from gsseg_core.files.run_folder import settle
-from gsseg_core.learn.temperature import tempered
+from gsseg_core.learn.temperature import tempered, tempered_rows
 from gsseg_core.raster.view_operator import ViewOperator
 from gsseg_core.raster.view_renderer import Blended
-from gsseg_core.refine.knn_filter import before_clustering, cluster_in_place, statistical_filter
+from gsseg_core.refine.knn_filter import before_clustering, cluster, statistical_filter
 from gsseg_core.refine.settings import RefineSettings
 from gsseg_core.refine.silhouette_carving import Silhouette, carve
 from gsseg_core.scene.camera import Camera
 from gsseg_core.scene.gaussian_scene import GaussianScene
 from gsseg_core.spatial.neighbourhood import neighbours_of
-from gsseg_core.spatial.row_order import take_rows
+from gsseg_core.spatial.row_order import inverse
 from gsseg_core.text import clipped
 
 T = TypeVar("T")
@@ -64,17 +65,18 @@ class Segmentation:
     ----------
     labels : (N,) int32
         Class id, or `UNOBSERVED` (-1), or `REMOVED` (-2).
-    probabilities : (N, K) float32
-        Rows sum to 1; zeros where unobserved. Removed Gaussians keep theirs. Once calibrated, they mean what they say.
-        Columns are the classes in the order of `class_names`: column k is class k, unless ids have gaps.
+    shares : CSRRows
+        Class probabilities (N, K) float32, as `probabilities` writes them out; of hundreds of classes, a Gaussian has a
+        few. Rows sum to 1; none has entries where unobserved. Removed Gaussians keep theirs. Once calibrated, they mean
+        what they say. Columns are the classes in the order of `class_names`: column k is class k, unless ids have gaps.
     class_names : dict of int to str
         Names by class id, ascending, one for each of the K columns.
     scene_digest : str
         Which scene it belongs to.
     clustered : (N,) bool
         Gaussians whose probabilities came from their neighbours.
-    learnt : (C, K) float32
-        What these had learnt themselves, in the order of the scene; zeros where unobserved. Not calibrated.
+    learnt : CSRRows
+        What these had learnt themselves, (C, K) float32, in the order of the scene. Not calibrated.
     temperature : float
         At which the probabilities are; 1 where they are those that blend, as they were learnt.
     ids : (N,) int64 or None
@@ -84,11 +86,11 @@ class Segmentation:
     """
 
     labels: np.ndarray
-    probabilities: np.ndarray
+    shares: CSRRows
     class_names: dict[int, str]
     scene_digest: str
     clustered: np.ndarray
-    learnt: np.ndarray
+    learnt: CSRRows
     temperature: float = 1.0
     ids: np.ndarray | None = None
     tree: ObjectTree | None = None
@@ -101,7 +103,6 @@ class Segmentation:
         class_names: Mapping[int, str],
         settings: RefineSettings | None = None,
         evidence: np.ndarray | None = None,
-        copy: bool = True,
     ) -> Segmentation:
         """Refine learnt codes by their neighbours, and label every Gaussian by its largest entry.
 
@@ -120,39 +121,44 @@ class Segmentation:
         evidence : (N,) float32, optional
             Weight of the pixels that each code was learnt from, in px, finite and at least 0: `Learner.evidence`.
             Neighbours weigh by it; without, all weigh the same. Raises as codes do.
-        copy : bool
-            Whether the codes stay as they are; else they are changed, and no memory is taken for others.
         """
         settings = settings or RefineSettings()
-        codes = np.array(codes, np.float32, order="C") if copy else np.require(codes, np.float32, ["C", "W"])
-        n, px = len(scene), np.asarray(np.zeros(len(scene)) if evidence is None else evidence, np.float32)
+        codes, n = np.asarray(codes, np.float32), len(scene)
+        px = np.asarray(np.zeros(n) if evidence is None else evidence, np.float32)
         if codes.ndim != 2 or len(codes) != n or px.shape != (n,):
             raise StateMismatchError(f"codes are {codes.shape}, evidence {px.shape}; expected ({n}, K) and ({n},)")
         if not (columns := range(codes.shape[1])) or not class_names.keys() <= {*columns}:
             raise SettingsError(f"class names have ids {clipped([*class_names])}; expected some of {columns}")
         check_class_names(class_names, SettingsError)
-        check_shares("codes", codes, SettingsError)
+        rows, names = CSRRows.from_dense(codes), {k: class_name(class_names, k) for k in columns}
+        check_shares("codes", rows, SettingsError)
         check_evidence(px, SettingsError)
-        result = cls.unfiltered(scene, codes, class_names, settings, None if evidence is None else px)
+        return cls.refined(scene, rows, names, settings, None if evidence is None else px)
+
+    @classmethod
+    def refined(
+        cls, scene: GaussianScene, codes: CSRRows, class_names: Mapping[int, str], settings: RefineSettings,
+        evidence: np.ndarray | None = None,
+    ) -> Segmentation:  # fmt: skip
+        """Do what `from_codes` does with codes that a learner has made, N rows, and names of all K classes."""
+        result = cls.unfiltered(scene, codes, class_names, settings, evidence)
         return result.filtered(scene, settings) if settings.filter else result
 
     @classmethod
     def unfiltered(
-        cls, scene: GaussianScene, codes: np.ndarray, class_names: Mapping[int, str], settings: RefineSettings,
+        cls, scene: GaussianScene, codes: CSRRows, class_names: Mapping[int, str], settings: RefineSettings,
         evidence: np.ndarray | None = None,
     ) -> Segmentation:  # fmt: skip
-        """Label learnt codes (N, K), after KNN clustering unless that is off, and leave the filter to the caller.
-
-        The codes, contiguous float32, become the probabilities: they are taken over, and changed. Evidence is (N,) px.
-        """
-        names = {k: class_name(class_names, k) for k in range(codes.shape[1])}
-        clustered, learnt = np.zeros(len(codes), bool), codes[:0].copy()
+        """Do what `refined` does, and leave the filter to the caller."""
+        refined, clustered = codes, np.zeros(len(scene), bool)
         if settings.cluster:
-            observed, neighbours = largest(codes)[0] > 0, neighbours_of(scene, settings.k)
-            px, means = evidence if settings.weigh else None, scene.means
-            clustered, learnt = cluster_in_place(means, codes, observed, settings.k, settings.beta, neighbours, px)
-        _, labels = largest(codes)  # -1, which is UNOBSERVED, where nothing is known
-        return cls(labels, codes, names, scene.digest, clustered, learnt, ids=scene.ids)
+            px, neighbours = evidence if settings.weigh else None, neighbours_of(scene, settings.k)
+            refined, clustered = cluster(
+                scene.means, codes, len(class_names), settings.k, settings.beta, neighbours, px
+            )
+        _, labels = largest(refined)  # -1, which is UNOBSERVED, where nothing is known
+        learnt = codes.take(np.flatnonzero(clustered))
+        return cls(labels, refined, dict(class_names), scene.digest, clustered, learnt, ids=scene.ids)
 
     def require(self, scene: GaussianScene) -> None:
         """Raise `StateMismatchError` unless this is a segmentation of a scene: its indices are of no other."""
@@ -163,7 +169,7 @@ class Segmentation:
     def filtered(self, scene: GaussianScene, settings: RefineSettings) -> Segmentation:
         """Take the outliers out of each object: the paper's statistical filter; `StateMismatchError` as in `carved`."""
         self.require(scene)
-        neighbours, classes = neighbours_of(scene, settings.k), self.probabilities.shape[1]
+        neighbours, classes = neighbours_of(scene, settings.k), len(self.class_names)
         out = statistical_filter(scene.means, self.labels, settings.k, settings.filter_sigmas, classes, neighbours)
         return self._without(out)
 
@@ -175,7 +181,7 @@ class Segmentation:
         """
         temperature = check_temperature(temperature, SettingsError)
         change = temperature / self.temperature
-        return replace(self, probabilities=tempered(self.probabilities, change), temperature=temperature)
+        return replace(self, shares=tempered_rows(self.shares, change), temperature=temperature)
 
     def at(self, granularity: float | None) -> Segmentation:
         """Cut the tree: the segmentation whose classes are its nodes at a granularity; by default, the objects.
@@ -194,9 +200,9 @@ class Segmentation:
             raise SettingsError("granularity needs objects that were found from ids of each view's own; found no tree")
         names = tree.names(self.class_names)
         # What blends into a view of a whole is the sum of what its objects do, as it was learnt.
-        probabilities, nodes = tree.shares_at(granularity, self.calibrated(1.0).probabilities, tree.leaves)
+        shares, nodes = tree.shares_at(granularity, self.calibrated(1.0).shares, tree.leaves)
         return replace(
-            self, labels=tree.labels_at(granularity, self.labels), probabilities=probabilities,
+            self, labels=tree.labels_at(granularity, self.labels), shares=shares,
             class_names={node: names[node] for node in nodes}, temperature=1.0, tree=None,
             learnt=tree.shares_at(granularity, self.learnt, tree.leaves[self.clustered])[0],
         ).calibrated(self.temperature)  # fmt: skip
@@ -248,24 +254,30 @@ class Segmentation:
         result = replace(self, labels=labels, class_names={int(ids[k]): names[k] for k in order})
         if order == sorted(order):
             return result
-        return replace(result, probabilities=self.probabilities[:, order], learnt=self.learnt[:, order])
+        places = inverse(np.array(order))
+        shares, learnt = (rows.in_columns(places[rows.indices]) for rows in (self.shares, self.learnt))
+        return replace(result, shares=shares, learnt=learnt)
 
     def in_order_of(self, digest: str, places: np.ndarray) -> Segmentation:
         """Give the result for the Gaussians in the order of the scene of a digest: places (N,) of these in this one."""
         learnt = np.cumsum(self.clustered)[places] - 1  # rows, of those that were clustered
         clustered = self.clustered[places]
         tree = self.tree and replace(self.tree, leaves=self.tree.leaves[places])
-        probabilities = take_rows(np.ascontiguousarray(self.probabilities), places)
         return replace(
-            self, labels=self.labels[places], probabilities=probabilities, clustered=clustered,
-            learnt=self.learnt[learnt[clustered]], scene_digest=digest, tree=tree,
+            self, labels=self.labels[places], shares=self.shares.take(places), clustered=clustered,
+            learnt=self.learnt.take(learnt[clustered]), scene_digest=digest, tree=tree,
             ids=None if self.ids is None else self.ids[places],
         )  # fmt: skip
 
     @cached_property
+    def probabilities(self) -> np.ndarray:
+        """Class probabilities with their zeros, (N, K) float32; 4 N K bytes, which nothing here takes but this."""
+        return self.shares.dense(len(self.class_names))
+
+    @cached_property
     def confidence(self) -> np.ndarray:
         """Largest probability of each Gaussian, (N,) float32; 0 where unobserved."""
-        return np.asarray(largest(np.ascontiguousarray(self.probabilities))[0])
+        return np.asarray(largest(self.shares)[0])
 
     def counts(self) -> np.ndarray:
         """Count the Gaussians of each class by id, (num_classes,) int64."""
@@ -336,7 +348,7 @@ class Segmentation:
 
     @cached_property
     def _blended(self) -> tuple[CSRRows, bool]:
-        codes = before_clustering(tempered(self.probabilities, 1 / self.temperature), self.clustered, self.learnt)
+        codes = before_clustering(tempered_rows(self.shares, 1 / self.temperature), self.clustered, self.learnt)
         return codes, bool((codes.indices == 0).any())
 
     def save(self, path: str | os.PathLike[str], run: str | None = None) -> None:
@@ -351,8 +363,9 @@ class Segmentation:
         """
         header = {"format": FORMAT, "scene": self.scene_digest, "class_names": self.class_names,
                   "temperature": self.temperature, **({} if run is None else {"run": run})}  # fmt: skip
-        names = ("labels", "probabilities", "class_ids", "confidence", "clustered", "learnt")
-        arrays = {name: getattr(self, name) for name in names}
+        names, k = ("labels", "class_ids", "confidence", "clustered"), len(self.class_names)
+        arrays: dict[str, Any] = {name: getattr(self, name) for name in names}
+        arrays |= {"probabilities": WithZeros(self.shares, k), "learnt": WithZeros(self.learnt, k)}
         if self.tree is not None:
             header["granularity"] = self.tree.level
             arrays |= self.tree.arrays()
@@ -381,9 +394,9 @@ class Segmentation:
                 raise UnfitError(f"class_names lack 0, the background; found {clipped(list(names))}")
             n, k = len(scene), len(names)
             labels = file.expect("labels", np.int32, (n,))
-            probabilities = file.expect("probabilities", np.float32, (n, k))
+            shares = file.expect_rows("probabilities", np.float32, (n, k))
             clustered = file.expect("clustered", bool, (n,))
-            learnt = file.expect("learnt", np.float32, (int(clustered.sum()), k))
+            learnt = file.expect_rows("learnt", np.float32, (int(clustered.sum()), k))
             unknown_ids = np.setdiff1d(labels, [REMOVED, UNOBSERVED, *names])
             if unknown_ids.size:
                 raise UnfitError(
@@ -392,7 +405,7 @@ class Segmentation:
                 )
             if "class_ids" in file.names and file.expect("class_ids", np.int32, (k,)).tolist() != list(names):
                 raise UnfitError("array class_ids holds other ids than class_names of its header; expected the same")
-            check_shares("probabilities", probabilities)
+            check_shares("probabilities", shares)
             check_shares("learnt", learnt)
             tree = ObjectTree.read(file, header, n, k)
-        return cls(labels, probabilities, names, scene.digest, clustered, learnt, temperature, scene.ids, tree)
+        return cls(labels, shares, names, scene.digest, clustered, learnt, temperature, scene.ids, tree)

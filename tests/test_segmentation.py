@@ -81,7 +81,7 @@ def test_neighbours_fill_in_what_was_unobserved_and_rows_sum_to_one() -> None:
     np.testing.assert_array_equal(result.clustered, ~codes.any(axis=1))
     np.testing.assert_allclose(result.probabilities.sum(axis=1), 1, atol=1e-5)
     assert (result.labels[TRUTH == 2] == 2).mean() > 0.8
-    np.testing.assert_array_equal(result.learnt, codes[result.clustered])
+    np.testing.assert_array_equal(result.learnt.dense(NUM_CLASSES), codes[result.clustered])
 
 
 def test_what_is_hardly_seen_tells_its_neighbours_little_unless_all_are_to_weigh_the_same() -> None:
@@ -134,8 +134,8 @@ def test_a_saved_segmentation_comes_back_exactly(tmp_path: Path) -> None:
     assert result.clustered.sum() > OUT_OF_SIGHT
     result.save(tmp_path / "segmentation.npz")
     again = Segmentation.load(tmp_path / "segmentation.npz", SCENE)
-    for name in ("labels", "probabilities", "confidence", "clustered", "learnt"):
-        one, two = getattr(result, name), getattr(again, name)
+    arrays = [(getattr(result, name), getattr(again, name)) for name in ("labels", "probabilities", "confidence")]
+    for one, two in [*arrays, (result.clustered, again.clustered), *zip(result.learnt, again.learnt, strict=True)]:
         assert one.dtype == two.dtype
         np.testing.assert_array_equal(one, two)
     assert again.class_names == NAMES and again.scene_digest == SCENE.digest
@@ -185,10 +185,10 @@ def test_evidence_that_is_no_number_of_pixels_is_refused_and_codes_stay_as_they_
     codes, evidence = CODES.copy(), np.ones(len(SCENE), np.float32)
     evidence[7] = value
     with pytest.raises(SettingsError, match=r"array evidence holds .* in row 7 \(1 of .* unusable\); expected"):
-        Segmentation.from_codes(SCENE, codes, NAMES, evidence=evidence, copy=False)
+        Segmentation.from_codes(SCENE, codes, NAMES, evidence=evidence)
     np.testing.assert_array_equal(codes, CODES)
     codes.setflags(write=False)
-    Segmentation.from_codes(SCENE, codes, NAMES, copy=False)  # What cannot be written is copied all the same.
+    Segmentation.from_codes(SCENE, codes, NAMES)
     np.testing.assert_array_equal(codes, CODES)
     listed = Segmentation.from_codes(SCENE, CODES, NAMES, evidence=[1.0] * len(SCENE))
     np.testing.assert_array_equal(listed.labels, Segmentation.from_codes(SCENE, CODES, NAMES).labels)
@@ -248,7 +248,7 @@ def test_a_result_in_the_order_of_another_scene_says_the_same_of_each_gaussian()
     assert moved.tree is not None
     np.testing.assert_array_equal(moved.tree.leaves, tree.leaves[places])
     back = moved.in_order_of(SCENE.digest, np.argsort(places))
-    np.testing.assert_array_equal(back.learnt, result.learnt)
+    np.testing.assert_array_equal(back.learnt.dense(NUM_CLASSES), result.learnt.dense(NUM_CLASSES))
 
 
 def test_levels_are_segmentations_whose_classes_are_the_nodes_there() -> None:

@@ -16,6 +16,7 @@ from typing import Any
 
 import numpy as np
 
+from gsseg_core.csr_rows import CSRRows
 from gsseg_core.data.class_names import class_name
 from gsseg_core.errors import SettingsError
 from gsseg_core.files.npz_files import NpzArrays, UnfitError
@@ -23,8 +24,6 @@ from gsseg_core.text import quoted
 
 PART, OBJECT, WHOLE = "part", "object", "whole"
 """What a node can be."""
-
-_ROWS = 1 << 10  # whose probabilities lie in the cache while column after column is added up
 
 
 @dataclass(frozen=True, eq=False)
@@ -166,30 +165,19 @@ class ObjectTree:
         largest[self._classes[order]] = order
         return largest
 
-    def shares_at(self, granularity: float, shares: np.ndarray, leaves: np.ndarray) -> tuple[np.ndarray, list[int]]:
-        """Turn class probabilities (n, K) of Gaussians with the leaves (n,) into those of the nodes of a level.
+    def shares_at(self, granularity: float, shares: CSRRows, leaves: np.ndarray) -> tuple[CSRRows, list[int]]:
+        """Turn class probabilities of Gaussians, n rows, with the leaves (n,) into those of the nodes of a level.
 
         A Gaussian's probability of its leaf's class goes to its own part, that of any other class to its largest part.
         Returns probabilities (n, K') float32 and the K' nodes of that level, ascending, so that classes come first.
         """
         table = self.cut(granularity)
-        tops = table[self._leaf_nodes]
-        nodes = np.unique(np.append(tops, 0))
-        column = np.zeros(len(self), np.int64)
+        nodes = np.unique(np.append(table[self._leaf_nodes], 0))
+        column = np.zeros(len(self), np.uint32)
         column[nodes] = np.arange(len(nodes))
-        usual = column[table[self._largest_leaf]]
-        out = np.zeros((len(shares), len(nodes)), np.float32)
-        for first in range(0, len(shares), _ROWS):
-            some, into = shares[first : first + _ROWS], out[first : first + _ROWS]
-            for k, to in enumerate(usual.tolist()):
-                into[:, to] += some[:, k]
-        rows = np.flatnonzero(leaves >= 0)
-        of_class, own = self._classes[leaves[rows]], column[table[leaves[rows]]]
-        moved = own != usual[of_class]
-        rows, of_class, own = rows[moved], of_class[moved], own[moved]
-        out[rows, usual[of_class]] -= shares[rows, of_class]
-        out[rows, own] += shares[rows, of_class]
-        return np.maximum(out, 0, out=out), nodes.tolist()
+        usual, leaf = column[table[self._largest_leaf]], np.repeat(leaves, np.diff(shares.indptr))
+        own = (leaf >= 0) & (self._classes[leaf] == shares.indices)
+        return shares.in_columns(np.where(own, column[table[leaf]], usual[shares.indices])), nodes.tolist()
 
     @cached_property
     def _leaf_nodes(self) -> np.ndarray:

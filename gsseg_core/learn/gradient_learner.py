@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 import torch
 
+from gsseg_core.csr_rows import CSRRows
 from gsseg_core.errors import SettingsError
 from gsseg_core.learn.fitted import all_or_nothing
 from gsseg_core.learn.learner import Learner, Progress, silent
@@ -118,7 +119,7 @@ class GradientLearner(Learner):
         progress("gradient", steps, steps)
         learnt: np.ndarray = torch.softmax(codes, dim=1).detach().numpy()
         learnt[~self.observed_] = 0.0
-        self.codes_ = learnt
+        self.code_rows_ = CSRRows.from_dense(learnt)
         self._finish()
         return self
 

@@ -11,6 +11,7 @@ from typing import Any, TypeVar
 
 import numpy as np
 
+from gsseg_core.csr_rows import CSRRows, largest
 from gsseg_core.data.soft_masks import SeenLabels
 from gsseg_core.data.view import View
 from gsseg_core.errors import NoUsableViewsError, SettingsError, StateMismatchError, UnknownLabelError
@@ -73,9 +74,11 @@ class Learner(ABC):
         Views that count, by name, in the order in which they came.
     rejected : dict of str to str
         Names of views that could not be used, and why.
+    code_rows_ : CSRRows
+        After `fit`: class probabilities of each Gaussian, the paper's object codes, float32; a row without entries
+        where no labelled pixel saw it, or all that is known is what it is not, see docs/masks.md.
     codes_ : (N, K) float32
-        After `fit`: class probabilities of each Gaussian, the paper's object codes; a row of zeros where no labelled
-        pixel saw it, or all that is known is what it is not, see docs/masks.md.
+        The same with its zeros, written out each time that it is asked for.
     observed_ : (N,) bool
         After `fit`: whether the Gaussian has a code.
     history_ : list of float
@@ -88,7 +91,7 @@ class Learner(ABC):
         Whether a report holds every mask against `predict_without`.
     """
 
-    codes_: np.ndarray
+    code_rows_: CSRRows
     observed_: np.ndarray
     converged_: bool = False
     leaves_out = False
@@ -187,13 +190,18 @@ class Learner(ABC):
             self._votes, self.num_classes = np.pad(self._votes[:, :num_classes], ((0, 0), (0, added))), num_classes
 
     @property
+    def codes_(self) -> np.ndarray:
+        """Class probabilities with their zeros, (N, K) float32, after `fit`."""
+        return self.code_rows_.dense(self.num_classes)
+
+    @property
     def loss(self) -> float:
         """What `fit` minimises, as of its last step, in nats per labelled pixel; NaN where there is no such thing."""
         return float("nan")
 
     @abstractmethod
     def fit(self: Self, progress: Progress = silent) -> Self:
-        """Learn `codes_` from the views observed so far; one that takes steps is `all_or_nothing`.
+        """Learn `code_rows_` from the views observed so far; one that takes steps is `all_or_nothing`.
 
         Raises
         ------
@@ -207,9 +215,9 @@ class Learner(ABC):
         After `fit`, for one of its views; what `leaves_out` its mask raises `SettingsError` for others. Nothing of the
         learner changes. Rows sum to less where little is known.
         """
-        if not hasattr(self, "codes_"):
+        if not hasattr(self, "code_rows_"):
             raise SettingsError(f"view {view.name!r} was not learnt from; expected it after fit()")
-        return self._blend_codes(self.codes_, view)
+        return self._blend_codes(self.code_rows_, view)
 
     def strongest_without(self, view: View, wanted: np.ndarray | None = None, grid: PixelGrid = NO_PIXELS) -> Strongest:
         """Tell the class of each pixel of a view by `predict_without`, and the probabilities of the pixels of a grid.
@@ -244,18 +252,25 @@ class Learner(ABC):
 
     def vote_codes(self) -> np.ndarray:
         """Votes as probabilities, (N, K) float32; a row of zeros where no labelled pixel saw the Gaussian."""
-        codes, possible = np.empty(self._votes.shape, np.float32), self._possible()
-        if normalise_votes(self._votes, possible, codes):
-            impute_probabilities(codes, self._votes, possible)
-        return codes
+        return self.vote_rows().dense(self.num_classes)
 
-    def vote_codes_without(self, name: str) -> np.ndarray:
-        """Votes of all other views as probabilities, (N, K) float32; a row of zeros where none saw the Gaussian."""
+    def vote_rows(self) -> CSRRows:
+        """Votes as probabilities, as `vote_codes`; rows of float32, without entries where those have zeros only."""
+        dense, possible = np.empty(self._votes.shape, np.float32), self._possible()
+        unsure = normalise_votes(self._votes, possible, dense)
+        codes = CSRRows.from_dense(dense)
+        if not unsure:
+            return codes
+        rows = np.flatnonzero(~dense.any(axis=1) & self._votes.any(axis=1))
+        return impute_probabilities(codes, self._votes, possible, rows)
+
+    def vote_rows_without(self, name: str) -> CSRRows:
+        """Votes of all other views as probabilities, as `vote_rows` has those of all."""
         observation = self.observation(name)
         with _VOTES_LENT:
             observation.vote(self._votes, UNITS, -1)
             try:
-                return self.vote_codes()
+                return self.vote_rows()
             finally:
                 observation.vote(self._votes, UNITS)
 
@@ -380,16 +395,15 @@ class Learner(ABC):
         """Clear codes without evidence, and impute those of Gaussians with votes only against classes."""
         unsure, against = ~self.observed_, weigh_votes(self._votes)[1] < 0
         # A Gaussian with votes for a class that is not `observed_` was seen in rejected regions only: it stays unknown.
-        self.codes_[unsure & ~against] = 0.0
+        codes = self.code_rows_.only(~(unsure & ~against))
         if (unsure & against).any():
-            impute_probabilities(self.codes_, self._votes, self._possible(), np.flatnonzero(unsure & against))
-            self.observed_[unsure] = self.codes_[unsure].any(axis=1)
+            codes = impute_probabilities(codes, self._votes, self._possible(), np.flatnonzero(unsure & against))
+            self.observed_[unsure] = largest(codes)[0][unsure] > 0
+        self.code_rows_ = codes
 
-    def _blend_codes(self, codes: np.ndarray, view: View) -> np.ndarray:
-        image, left_over = self._operator_of(view).blend(codes)
-        if codes[:, 0].any():
-            image[..., 0] += left_over
-        return image
+    def _blend_codes(self, codes: CSRRows, view: View) -> np.ndarray:
+        background = bool((codes.indices == 0).any())
+        return self._operator_of(view).blend_probabilities(codes, self.num_classes, background)
 
     def _possible(self) -> np.ndarray:
         """Mark the ids that are classes, (K,) bool: those that views name; all, where one of them has no names."""

@@ -6,7 +6,6 @@ has become.
 
 from __future__ import annotations
 
-import json
 import os
 from collections import Counter
 from collections.abc import Callable, Mapping
@@ -16,6 +15,7 @@ from typing import Any
 
 import numpy as np
 
+from gsseg_core.csr_rows import CSRRows
 from gsseg_core.data.class_names import check_same_names
 from gsseg_core.data.label_evidence import LabelEvidence
 from gsseg_core.data.label_images import PER_VIEW, UNKNOWN
@@ -27,6 +27,7 @@ from gsseg_core.files.limits import LIMITS, MAX_LABEL
 from gsseg_core.files.npz_files import (
     NpzArrays,
     UnfitError,
+    WithZeros,
     check_evidence,
     check_scene,
     check_shares,
@@ -35,6 +36,7 @@ from gsseg_core.files.npz_files import (
     open_npz,
     temperature_of,
     whole_number,
+    write_arrays,
 )
 from gsseg_core.scene import living_files
 from gsseg_core.scene.camera import Camera
@@ -60,13 +62,13 @@ class Learnt:
     """Class probabilities that a learner has found."""
 
     learner: str  # its name
-    codes: np.ndarray  # (N, K) float32: class probabilities; a row of zeros where no labelled pixel saw the Gaussian
+    codes: CSRRows  # (N, K) float32: class probabilities; no entries where no labelled pixel saw the Gaussian
     num_views: int  # that it learnt from
     temperature: float = 1.0  # at which the codes are probabilities, see `gsseg_core.learn.calibrate`
     evidence: np.ndarray | None = None  # (N,) float32: px that the codes stand on; an older state does not say
 
-    def carried(self, carry: Callable[[np.ndarray], np.ndarray]) -> Learnt:
-        """Return it for a scene that has changed; `carry` makes the rows of an array, (N, ...), those of now."""
+    def carried(self, carry: Callable[[Any], Any]) -> Learnt:
+        """Return it for a scene that has changed; `carry` makes rows of Gaussians, dense or sparse, those of now."""
         evidence = None if self.evidence is None else carry(self.evidence)
         return replace(self, codes=carry(self.codes), evidence=evidence)
 
@@ -87,7 +89,7 @@ class State:
     @property
     def num_classes(self) -> int:
         """Classes of votes or codes."""
-        return max(int(self.votes.shape[1]), 0 if self.learnt is None else int(self.learnt.codes.shape[1]))
+        return int(self.votes.shape[1])
 
     def check_names(self, known: Mapping[int, str], source: str | os.PathLike[str], where: str) -> None:
         """Raise `StateFileError` if this state, of `source`, calls a class otherwise than it is called elsewhere."""
@@ -116,10 +118,10 @@ class State:
         }
         if self.per_view:
             header["ids"] = PER_VIEW
-        arrays = {"seen": seen.astype(np.int64), "votes": self.votes[seen]}
+        arrays: dict[str, Any] = {"seen": seen.astype(np.int64), "votes": self.votes[seen]}
         if self.learnt is not None:
             header["learnt"] = {name: getattr(self.learnt, name) for name in ("learner", "num_views", "temperature")}
-            arrays["codes"] = self.learnt.codes
+            arrays["codes"] = WithZeros(self.learnt.codes, self.num_classes)
             if self.learnt.evidence is not None:
                 arrays["evidence"] = self.learnt.evidence
         if self.living is not None:
@@ -132,9 +134,8 @@ class State:
                 if evidence.supervised is not None:
                     arrays[f"supervised_{i}"] = evidence.supervised
             arrays[f"pose_{i}"] = np.stack([np.pad(view.camera.K, (0, 1)), view.camera.world_to_camera])
-        with write_atomically(path) as temporary, open(temporary, "wb") as file:
-            # Without allow_pickle=False, which NumPy 1.26 would take for one more array.
-            np.savez_compressed(file, header=np.array(json.dumps(header)), **arrays)  # type: ignore[arg-type]
+        with write_atomically(path) as temporary:
+            write_arrays(temporary, header, **arrays)
             check_replaceable(path, "saved state", npz_format(path) in _FORMATS)  # To save takes long.
 
     @classmethod
@@ -197,9 +198,9 @@ class State:
         learnt = None
         if "learnt" in header:
             entry = header["learnt"]
-            codes = file.expect("codes", np.float32, (n, None))
-            if not 1 <= codes.shape[1] <= k:
-                raise UnfitError(f"array codes is of {codes.shape[1]} classes; expected 1 to {k}")
+            codes = file.expect_rows("codes", np.float32, (n, None))
+            if not 1 <= (found := file.header("codes").shape[1]) <= k:
+                raise UnfitError(f"array codes is of {found} classes; expected 1 to {k}")
             check_shares("codes", codes)
             num_views = whole_number(entry["num_views"], "num_views of what was learnt", 0, _MOST_VIEWS)
             learnt = Learnt(str(entry["learner"]), codes, num_views, temperature_of(entry), _read_evidence(file, n))

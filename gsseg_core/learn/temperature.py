@@ -19,14 +19,15 @@ expectation-maximisation, with a prior of `RIGHT` times the pixels of each class
 
 from __future__ import annotations
 
-import os
 from collections.abc import Callable, Sequence
-from concurrent.futures import ThreadPoolExecutor
 from typing import NamedTuple
 
+import numba as nb
 import numpy as np
 
+from gsseg_core.csr_rows import CSRRows
 from gsseg_core.errors import SettingsError
+from gsseg_core.kernels.compiler import kernel
 from gsseg_core.raster.view_renderer import PixelGrid
 
 LOWEST, HIGHEST = 0.2, 5.0  # temperatures that are tried
@@ -38,8 +39,8 @@ RIGHT = 0.3
 OUTLIERS = 1e-3  # share of pixels that carry any label of the view by chance
 _PRECISION = 0.02  # of the logarithm of the temperature
 _TINY = 1e-12
-_SMALLEST = float(np.finfo(np.float32).tiny)
-_AT_A_TIME = 1 << 18  # shares of which powers are taken: what lies between stays in the cache
+_LEAST = np.finfo(np.float32).tiny
+_SMALLEST = float(_LEAST)
 
 
 def tempered(
@@ -52,34 +53,41 @@ def tempered(
     array is returned; else no entry is above 1. Going to a temperature and then to its reciprocal leads back, up to
     rounding and to entries that are too small for the type. Raises `SettingsError` for what is no temperature.
     """
-    if not _SMALLEST < temperature < 1 / _SMALLEST:
-        raise SettingsError(f"temperature is {temperature}; expected a number above 0 that float32 can hold")
+    _check(temperature)
     if temperature == 1:
         return shares
-    if shares.ndim != 2 or shares.size <= _AT_A_TIME:
-        return _tempered(shares, temperature)
-    rows = max(_AT_A_TIME // shares.shape[1], 1)
-    parts = [slice(first, first + rows) for first in range(0, len(shares), rows)]
-    out = np.empty(shares.shape, np.float32)
+    rows = CSRRows.from_dense(shares.reshape(-1, shares.shape[-1]).astype(np.float32, copy=False))
+    return tempered_rows(rows, temperature).dense(shares.shape[-1]).reshape(shares.shape)
 
-    def temper(part: slice) -> None:
-        out[part] = _tempered(shares[part], temperature)
 
-    with ThreadPoolExecutor(os.cpu_count()) as threads:
-        list(threads.map(temper, parts))
+def tempered_rows(shares: CSRRows, temperature: float) -> CSRRows:
+    """Do with sparse shares, float32, what `tempered` does; zeros take neither memory nor time."""
+    _check(temperature)
+    return shares if temperature == 1 else shares.with_data(_powers(shares, np.float32(temperature)))
+
+
+def _check(temperature: float) -> None:
+    if not _SMALLEST < temperature < 1 / _SMALLEST:
+        raise SettingsError(f"temperature is {temperature}; expected a number above 0 that float32 can hold")
+
+
+@kernel(parallel=True)
+def _powers(rows: CSRRows, temperature: np.float32) -> np.ndarray:
+    indptr, _, data = rows
+    out = np.empty_like(data)
+    for i in nb.prange(indptr.shape[0] - 1):
+        known, peak, total = np.float32(0), np.float32(0), np.float32(0)
+        for z in range(indptr[i], indptr[i + 1]):
+            known += data[z]
+            peak = max(peak, data[z])
+        for z in range(indptr[i], indptr[i + 1]):
+            # The logarithm of 0 is minus infinity, of which any power is 0 again.
+            out[z] = np.exp(np.log(data[z] / max(peak, _LEAST)) / temperature)
+            total += out[z]
+        for z in range(indptr[i], indptr[i + 1]):
+            # Rounding may take the only class of a row above the whole, and the whole above 1.
+            out[z] = min(out[z] * (known / max(total, _LEAST)), min(known, np.float32(1)))
     return out
-
-
-def _tempered(shares: np.ndarray, temperature: float) -> np.ndarray:
-    known, peak = np.einsum("...k->...", shares)[..., None], shares.max(axis=-1, keepdims=True, initial=0)
-    with np.errstate(divide="ignore"):  # The logarithm of 0, of which any power is 0 again.
-        powers = np.log(np.divide(shares, np.maximum(peak, _SMALLEST), dtype=np.float32))
-    powers /= np.float32(temperature)
-    np.exp(powers, out=powers)
-    powers *= known / np.maximum(np.einsum("...k->...", powers)[..., None], _SMALLEST)
-    # Rounding may take the only class of a row above the whole, and the whole above 1.
-    np.minimum(powers, np.minimum(known, 1), out=powers)
-    return powers
 
 
 class Sample(NamedTuple):

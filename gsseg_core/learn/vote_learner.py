@@ -6,6 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 
+from gsseg_core.csr_rows import largest
 from gsseg_core.data.view import View
 from gsseg_core.learn.learner import Learner, Progress, silent
 from gsseg_core.scene.camera import Camera
@@ -22,8 +23,8 @@ class VoteLearner(Learner):
     def fit(self, progress: Progress = silent) -> VoteLearner:
         """Normalise the votes."""
         self._require_views()
-        self.codes_, self.converged_ = self.vote_codes(), True
-        self.observed_ = np.asarray(self.codes_.any(axis=1))
+        self.code_rows_, self.converged_ = self.vote_rows(), True
+        self.observed_ = largest(self.code_rows_)[0] > 0
         return self
 
     def move(self, name: str, camera: Camera) -> None:
@@ -40,4 +41,4 @@ class VoteLearner(Learner):
 
     def predict_without(self, view: View) -> np.ndarray:
         """Blend into a view the votes of all others as probabilities, (H, W, K) float32; exact, by subtraction."""
-        return self._blend_codes(self.vote_codes_without(view.name), view)
+        return self._blend_codes(self.vote_rows_without(view.name), view)

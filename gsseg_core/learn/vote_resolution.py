@@ -30,26 +30,28 @@ def resolved_votes(votes: CSRRows, possible: np.ndarray) -> CSRRows:  # int64; (
 
 
 def impute_probabilities(
-    codes: np.ndarray,  # (N, K) float32, changed in place
+    codes: CSRRows,  # N rows of float32
     votes: np.ndarray,  # (N, K) int64
     possible: np.ndarray,  # (K,) bool: ids that are classes
-    rows: np.ndarray | None = None,  # Gaussians with votes only against classes; found if not given
-) -> None:
+    rows: np.ndarray,  # (U,) Gaussians with votes only against classes, ascending
+) -> CSRRows:
     """Impute probabilities of Gaussians with votes only against classes: those that are left share them.
 
     They do so in proportion to how frequent they are in the scene, on top of the probabilities that the row has from
     its neighbours. The background is that to which no class applies, so its frequency is known only if every class was
     looked for in some view. If one never was, only neighbours count, and without them the row stays zero: unknown.
     """
-    if rows is None:
-        rows = np.flatnonzero(~codes.any(axis=1) & votes.any(axis=1))
     candidates = (votes[rows] >= 0) & possible
-    left = codes[rows] * candidates
+    left = codes.take(rows).dense(len(possible)) * candidates
     if not (possible & ~votes.any(axis=0))[1:].any():
-        sure = np.ones(len(codes), bool)
+        sure = np.ones(codes.num_rows, bool)
         sure[rows] = False
-        left += _frequency(codes[sure].sum(axis=0, dtype=np.float64), candidates) * candidates
-    codes[rows] = _scaled(left)
+        known = codes.only(sure)
+        frequent = np.bincount(known.indices, weights=known.data, minlength=len(possible))
+        left += _frequency(frequent, candidates) * candidates
+    imputed = np.full(codes.num_rows, -1)
+    imputed[rows] = np.arange(len(rows))
+    return codes.replaced(imputed, CSRRows.from_dense(_scaled(left)))
 
 
 def _frequency(

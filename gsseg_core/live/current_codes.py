@@ -7,6 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from gsseg_core.csr_rows import CSRRows, largest
 from gsseg_core.learn.learner import Learner
 from gsseg_core.learn.learner_state import Learnt
 from gsseg_core.progress import Stopwatch
@@ -21,7 +22,7 @@ class Known:
     """What a session knows at one moment, copied, so that it can be segmented while the session goes on."""
 
     scene: GaussianScene
-    codes: np.ndarray  # (N, K) float32
+    codes: CSRRows  # (N, K) float32
     evidence: np.ndarray | None  # (N,) float32, px; None where it is not known, or not asked for
     class_names: Mapping[int, str]
     cameras: Sequence[Camera]  # by which objects are carved
@@ -40,13 +41,16 @@ class Known:
         return result.calibrated(self.temperature)
 
 
-def current_codes(votes: Learner, learnt: Learnt | None) -> np.ndarray:
-    """Class probabilities of every Gaussian, (N, K) float32; a row of zeros where nothing is known."""
-    codes = votes.vote_codes()
-    if learnt is not None:
-        known = learnt.codes.any(axis=1)
-        codes[known] = np.pad(learnt.codes[known], ((0, 0), (0, codes.shape[1] - learnt.codes.shape[1])))
-    return codes
+def current_codes(votes: Learner, learnt: Learnt | None) -> CSRRows:
+    """Class probabilities of every Gaussian, (N, K) float32; a row without entries where nothing is known."""
+    codes = votes.vote_rows()
+    if learnt is None:
+        return codes
+    return codes.replaced(np.where(_known(learnt), np.arange(codes.num_rows), -1), learnt.codes)
+
+
+def _known(learnt: Learnt) -> np.ndarray:  # (N,) bool
+    return np.asarray(largest(learnt.codes)[0] > 0)
 
 
 def current_evidence(votes: Learner, learnt: Learnt | None) -> np.ndarray | None:
@@ -54,4 +58,4 @@ def current_evidence(votes: Learner, learnt: Learnt | None) -> np.ndarray | None
     evidence = votes.evidence()
     if learnt is None:
         return evidence
-    return None if learnt.evidence is None else np.where(learnt.codes.any(axis=1), learnt.evidence, evidence)
+    return None if learnt.evidence is None else np.where(_known(learnt), learnt.evidence, evidence)

@@ -27,5 +27,5 @@ def fitted(name: str, learner: Learner, views: Sequence[View], report: Report, w
         learner.fit(progress)
     with watch.stage("calibrate"):
         temperature = calibrate(learner, progress=progress).temperature
-    learnt = Learnt(name, learner.codes_, len(learner.views), temperature, learner.evidence())
+    learnt = Learnt(name, learner.code_rows_, len(learner.views), temperature, learner.evidence())
     return Outcome(learnt, len(learner.history_), learner.converged_, learner.loss, dict(learner.rejected))

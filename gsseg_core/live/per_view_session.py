@@ -173,7 +173,9 @@ class PerViewSession(LiveSession):
 
 
 def _renumbered(learnt: Learnt, successors: np.ndarray) -> Learnt:
-    return replace(learnt, codes=_renumber(learnt.codes, successors))
+    codes, table = learnt.codes, np.arange(int(learnt.codes.indices.max(initial=0)) + 1)
+    table[: len(successors)] = successors[: len(table)]
+    return replace(learnt, codes=codes.in_columns(table[codes.indices]))
 
 
 def _renumber(columns: np.ndarray, successors: np.ndarray) -> np.ndarray:

@@ -7,15 +7,20 @@ stay what they are, bit for bit, unless one that changed in this frame reaches t
 from __future__ import annotations
 
 from collections.abc import Callable
+from typing import TypeVar
 
 import numpy as np
 
+from gsseg_core.csr_rows import CSRRows
 from gsseg_core.data.view import View
 from gsseg_core.raster.cpu.occlusion import nearest_depths
 from gsseg_core.scene.group_frames import is_same, relation
 from gsseg_core.scene.living_scene import LivingScene
 
 _MARGIN = 1 + 1e-5
+
+Rows = TypeVar("Rows", np.ndarray, CSRRows)
+"""What Gaussians have, dense or sparse."""
 
 
 class SceneChange:
@@ -59,7 +64,7 @@ class SceneChange:
         # Depths are compared with a margin many times what rounding could make of them.
         return ends is None or bool((nearest < np.inf)[nearest <= ends() * _MARGIN].any())
 
-    def carry(self, rows: np.ndarray) -> np.ndarray:  # (N, ...)
+    def carry(self, rows: Rows) -> Rows:  # (N, ...)
         """Take what Gaussians had before along to where they are, (N', ...); zeros for those that were not there."""
         return carried(rows, self.origin)
 
@@ -100,8 +105,10 @@ class SceneChange:
         return self._parts[group]
 
 
-def carried(rows: np.ndarray, origin: np.ndarray) -> np.ndarray:  # (N, ...), (N',)
+def carried(rows: Rows, origin: np.ndarray) -> Rows:  # (N, ...), (N',)
     """Take rows of Gaussians along to where they are, (N', ...); zeros where the origin is -1."""
+    if isinstance(rows, CSRRows):
+        return CSRRows.empty(len(origin), rows.data.dtype).replaced(origin, rows)
     out = np.zeros((len(origin), *rows.shape[1:]), rows.dtype)
     found = origin >= 0
     out[found] = rows[origin[found]]

@@ -12,6 +12,7 @@ from weakref import WeakKeyDictionary
 
 import numpy as np
 
+from gsseg_core.csr_rows import CSRRows
 from gsseg_core.data.class_names import class_name
 from gsseg_core.data.dataset import Dataset
 from gsseg_core.data.view import View, spread
@@ -244,9 +245,12 @@ class LiveSession:
             Nothing has been fused or learnt yet.
         """
         with self._lock:
-            if not self.has_codes:
-                raise NoCodesError("no view has been fused and nothing learnt; expected at least one posed mask")
-            return current_codes(self._live, self._learnt)
+            return self._code_rows().dense(self._live.num_classes)
+
+    def _code_rows(self) -> CSRRows:
+        if not self.has_codes:
+            raise NoCodesError("no view has been fused and nothing learnt; expected at least one posed mask")
+        return current_codes(self._live, self._learnt)
 
     def segmentation(self, settings: RefineSettings | None = None, watch: Stopwatch | None = None) -> Segmentation:
         """Refine the class probabilities and label every Gaussian; kept until they or the settings change.
@@ -267,7 +271,7 @@ class LiveSession:
             # Of a dataset's views and of those that are kept; a state without either has nothing carved.
             cameras = [*self._cameras, *(view.camera for view in self._posed_views())]
             with watch.stage("codes"):
-                weighs, codes, learnt = settings.cluster and settings.weigh, self.codes(), self._learnt
+                weighs, codes, learnt = settings.cluster and settings.weigh, self._code_rows(), self._learnt
                 evidence = current_evidence(self._live, learnt) if weighs else None
                 temperature = 1.0 if learnt is None else learnt.temperature
                 known = Known(self.scene, codes, evidence, self.class_names, cameras, temperature)
@@ -279,7 +283,7 @@ class LiveSession:
     def unrefined(self) -> Segmentation:
         """Label every Gaussian by its class probabilities as they are now; raises `NoCodesError`, as `codes` does."""
         with self._lock:
-            result = Segmentation.unfiltered(self.scene, self.codes(), self.class_names, UNREFINED)
+            result = Segmentation.unfiltered(self.scene, self._code_rows(), self.class_names, UNREFINED)
             self._scenes[result] = self.scene
         return result
 

@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 
+from gsseg_core.csr_rows import largest
 from gsseg_core.data.class_names import BACKGROUND_NAME
 from gsseg_core.data.label_images import UNKNOWN
 from gsseg_core.data.view import View
@@ -212,11 +213,10 @@ class ObjectTable:
     def with_tree(self, segmentation: Segmentation) -> Segmentation:
         """Add parts and wholes to a segmentation of the scene whose classes are these objects, by the views kept."""
         segmentation.require(self.scene)
-        classes, probabilities = segmentation.labels.copy(), segmentation.probabilities
-        removed = classes == REMOVED  # It covers an object still.
-        classes[removed] = probabilities[removed].argmax(axis=1)
+        labels, likely = segmentation.labels, np.maximum(largest(segmentation.shares)[1], 0)
+        classes = np.where(labels == REMOVED, likely, labels)  # What was removed covers an object still.
         level = _EARLY_GRANULARITY if self._agreement is None else self._agreement
-        tree = grow_tree(self.scene.means, classes, probabilities.shape[1], self._lifted, level, self.settings)
+        tree = grow_tree(self.scene.means, classes, len(segmentation.class_names), self._lifted, level, self.settings)
         return replace(segmentation, tree=tree)
 
     def relabelled(self, view: View) -> View:

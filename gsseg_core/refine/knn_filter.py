@@ -8,27 +8,25 @@ from __future__ import annotations
 
 import numpy as np
 
-from gsseg_core.csr_rows import CSRRows, largest, starts
+from gsseg_core.csr_rows import CSRRows, largest
 from gsseg_core.refine.settings import RefineSettings
 from gsseg_core.spatial.class_distances import class_distances
 from gsseg_core.spatial.neighbourhood import Neighbours, neighbour_weights
 from gsseg_core.spatial.row_order import rows_by_label
 
-_ROWS = 1 << 12  # of codes that are copied at a time
 
-
-def cluster_in_place(
+def cluster(
     means: np.ndarray,  # (N, 3) float32, finite, scene units
-    codes: np.ndarray,  # (N, K) float32, contiguous, rows on the simplex, written to; not read where unobserved
-    observed: np.ndarray,  # (N,) bool: whether any view saw the Gaussian
+    codes: CSRRows,  # N rows of float32 on the simplex; without entries where no view saw the Gaussian
+    num_classes: int,
     k: int = RefineSettings.k,  # at least 1
     beta: float = RefineSettings.beta,
     neighbours: Neighbours | None = None,  # of `means` for this k, if they are known already
     evidence: np.ndarray | None = None,  # (N,) px that each code stands on, for `neighbour_weights`
-) -> tuple[np.ndarray, np.ndarray]:
+) -> tuple[CSRRows, np.ndarray]:
     """Give every unsure and every unobserved Gaussian the mean code of the observed ones among its k nearest.
 
-    Returns which rows changed, (N,) bool, and what these were before, (M, K) float32.
+    Returns the codes, and which rows changed, (N,) bool.
 
     Unsure are those whose largest probability is below `beta`. All neighbours' codes are those from before the step.
     Where the paper is silent: codes are averaged as probabilities, not as logits; a Gaussian is not its own neighbour;
@@ -40,34 +38,32 @@ def cluster_in_place(
     --------
     >>> import numpy as np
     >>> means = np.array([[0, 0, 0], [1, 0, 0], [3, 0, 0]], np.float32)
-    >>> codes = np.array([[0, 1], [0.5, 0.5], [0.25, 0.75]], np.float32)
-    >>> changed, before = cluster_in_place(means, codes, np.array([True, True, True]), k=1)
-    >>> codes.tolist()
+    >>> codes = CSRRows.from_dense(np.array([[0, 1], [0.5, 0.5], [0.25, 0.75]], np.float32))
+    >>> clustered, changed = cluster(means, codes, 2, k=1)
+    >>> clustered.dense(2).tolist()
     [[0.0, 1.0], [0.0, 1.0], [0.25, 0.75]]
     """
-    wanted = ~observed | (largest(codes)[0] < beta)
+    most = largest(codes)[0]
+    observed = most > 0
+    wanted = ~observed | (most < beta)
     if len(means) < 2 or not wanted.any() or not observed.any():
-        return np.zeros(len(codes), bool), np.empty((0, codes.shape[1]), np.float32)
-    known, before = neighbours or Neighbours.among(means, k), CSRRows.from_dense(codes)
+        return codes, np.zeros(len(means), bool)
     weights = observed if evidence is None else neighbour_weights(observed, evidence)
-    changed = known.average_into(codes, before, weights, wanted)
-    return changed, before.take(np.flatnonzero(changed)).dense(codes.shape[1])
+    known = neighbours or Neighbours.among(means, k)
+    mean = known.mean_codes(codes, weights, num_classes, wanted)
+    changed = np.diff(mean.indptr) > 0
+    return codes.replaced(np.where(changed, np.arange(len(means)), -1), mean), changed
 
 
 def before_clustering(
-    codes: np.ndarray,  # (N, K) float32
-    clustered: np.ndarray,  # (N,) bool: which of them `cluster_in_place` changed
-    learnt: np.ndarray,  # (C, K) float32: what these were before
+    codes: CSRRows,  # N rows
+    clustered: np.ndarray,  # (N,) bool: which of them `cluster` changed
+    learnt: CSRRows,  # C rows: what these were before
 ) -> CSRRows:
     """Give the codes that Gaussians have learnt themselves, and of those that learnt nothing what they are."""
-    rows, parts = starts(clustered), list[CSRRows]()
-    for first in range(0, max(len(codes), 1), _ROWS):  # A copy of all would take as much memory as they.
-        part = codes[first : first + _ROWS].copy()
-        before = learnt[rows[first] : rows[first + len(part)]]
-        known = before.any(axis=1)
-        part[np.flatnonzero(clustered[first : first + _ROWS])[known]] = before[known]
-        parts.append(CSRRows.from_dense(part))
-    return CSRRows.vstack(parts)
+    rows = np.full(len(clustered), -1)
+    rows[clustered] = np.where(largest(learnt)[0] > 0, np.arange(learnt.num_rows), -1)
+    return codes.replaced(rows, learnt)
 
 
 def statistical_filter(

@@ -19,7 +19,6 @@ from dataclasses import dataclass
 import numba as nb
 import numpy as np
 
-from gsseg_core.csr_rows import largest
 from gsseg_core.errors import SceneValueError, SettingsError
 from gsseg_core.kernels.compiler import kernel
 from gsseg_core.simd import LANES, add_scaled, differ, divided, empty_rows, load_row, prefetch, store_row, zero_row
@@ -84,7 +83,7 @@ def propagate(
     out = codes.copy()
     if settings.strength == 0 or settings.steps == 0:
         return out
-    known = (largest(codes)[0] > 0)[graph.order]
+    known = np.asarray(codes.any(axis=1))[graph.order]
     weight = np.where(known, evidence[graph.order] / settings.strength, 0).astype(np.float32)
     moving = weight < 100
     readers = _readers(graph.indptr, graph.indices, moving)

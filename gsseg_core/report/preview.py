@@ -9,8 +9,9 @@ from typing import Any
 
 import numpy as np
 
+from gsseg_core.csr_rows import CSRRows, largest
 from gsseg_core.data.object_tree import ObjectTree
-from gsseg_core.learn.temperature import tempered
+from gsseg_core.learn.temperature import tempered_rows
 from gsseg_core.scene.camera import Camera
 from gsseg_core.scene.gaussian_scene import GaussianScene
 from gsseg_core.segmentation import UNOBSERVED, Segmentation
@@ -77,9 +78,10 @@ def make_preview(
     if tree is not None:
         labels, first = tree.labels_at(1.0, labels), len(tree)
     picked, chance = _draw(np.sqrt(area) * scene.opacities, labels, most)
-    labels, probabilities, nodes = labels[picked], segmentation.probabilities[picked], segmentation.class_ids
+    labels, shares, nodes = labels[picked], segmentation.shares.take(picked), segmentation.class_ids
     if tree is not None:
-        probabilities, nodes = _of_parts(probabilities, segmentation.temperature, tree, picked)
+        shares, nodes = _of_parts(shares, segmentation.temperature, tree, picked)
+    confidence, column = largest(shares)
     means, nearer = _contracted(scene.means[picked].astype(np.float64), core)
     low, high = (means.min(axis=0), means.max(axis=0)) if len(means) else core
     extent = max(float((high - low).max()), 1e-9)
@@ -87,7 +89,7 @@ def make_preview(
     # Gaussians thinner than a thousandth of a pixel of any screen look like those that are not.
     logs = np.log(np.clip(sizes, 1e-5 * extent, extent))
     log_scales = np.array([logs.min(), logs.max()] if len(logs) else [0.0, 1.0], np.float64)
-    others = first + np.where(labels == UNOBSERVED, 0, 1 + nodes[probabilities.argmax(axis=1)])
+    others = first + np.where(labels == UNOBSERVED, 0, 1 + nodes[np.maximum(column, 0)])
     records = np.zeros(len(picked), RECORD)
     records["position"] = _quantised(means, low, high, 65535)
     records["label"] = np.where(labels < 0, others, labels)
@@ -95,19 +97,17 @@ def make_preview(
     records["scale"] = _quantised(logs, log_scales[0], log_scales[1], 255)
     records["opacity"] = np.rint(255 * scene.opacities[picked])
     records["color"] = np.rint(255 * np.clip(scene.colors(ids=picked), 0, 1))
-    records["confidence"] = np.rint(255 * np.clip(probabilities.max(axis=1), 0, 1))
+    records["confidence"] = np.rint(255 * np.clip(confidence, 0, 1))
     return Preview(records, low, high, core, log_scales, len(scene) - len(picked))
 
 
-def _of_parts(
-    probabilities: np.ndarray, temperature: float, tree: ObjectTree, ids: np.ndarray
-) -> tuple[np.ndarray, np.ndarray]:
+def _of_parts(shares: CSRRows, temperature: float, tree: ObjectTree, ids: np.ndarray) -> tuple[CSRRows, np.ndarray]:
     """Turn probabilities (M, K) of Gaussians (M,) into those of the finest parts, (M, K'), and name their nodes, (K',).
 
-    They are those of `Segmentation.at`, which takes the memory of all N.
+    They are those of `Segmentation.at`, which takes the time for all N.
     """
-    shares, nodes = tree.shares_at(1.0, tempered(probabilities, 1 / temperature), tree.leaves[ids])
-    return tempered(shares, temperature), np.array(nodes)
+    of_parts, nodes = tree.shares_at(1.0, tempered_rows(shares, 1 / temperature), tree.leaves[ids])
+    return tempered_rows(of_parts, temperature), np.array(nodes)
 
 
 def look_from(cameras: Iterable[Camera], preview: Preview) -> list[dict[str, Any]]:

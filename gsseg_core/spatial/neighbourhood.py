@@ -26,7 +26,6 @@ from gsseg_core.scene.scene_cache import PerScene
 from gsseg_core.simd import at_most, first_bit, load_row
 from gsseg_core.spatial import knn
 from gsseg_core.spatial.kd_tree import LEAF, Tree, leaf_range, scaled, tree_of
-from gsseg_core.spatial.row_order import inverse
 
 CODE_UNIT = 2.0**-24  # codes are summed in steps of this, which is the precision of a float32 near 1
 ROWS_AT_ONCE = 1 << 16  # points whose mean codes are written out at once
@@ -84,37 +83,31 @@ class Neighbours:
         codes: CSRRows,  # N rows of K classes, float32 in [0, 1]
         weights: np.ndarray,  # (N,) float32 in [0, 1], or bool
         num_classes: int,
+        wanted: np.ndarray | None = None,  # (N,) bool; all by default
     ) -> CSRRows:
-        """Weighted mean codes of the k nearest others, N rows; one without entries where none weighs anything."""
-        asked, means_of = self._asked(codes, weights, np.ones(len(weights), bool))
+        """Weighted mean codes of the k nearest others, N rows; one without entries where none weighs anything.
+
+        Rows that are not wanted have no entries either.
+        """
+        order = self.tree.order
+        selected = np.ones(len(order), bool) if wanted is None else wanted[order]
+        means_of, parts = self._prepared(codes, weights, selected), [CSRRows.empty(0)]
         # A block at a time is written out in full, so that of all the codes only what is not zero is ever in memory.
-        parts = []
+        asked = np.flatnonzero(selected).astype(np.int32)
         for first in range(0, len(asked), ROWS_AT_ONCE):
             places = asked[first : first + ROWS_AT_ONCE]
-            out, rows = np.zeros((len(places), num_classes), np.float32), np.arange(len(places), dtype=np.int32)
-            means_of(places, rows, out, np.zeros(len(places), bool))
+            out = np.zeros((len(places), num_classes), np.float32)
+            means_of(places, out)
             parts.append(CSRRows.from_dense(out))
-        return CSRRows.vstack(parts).take(inverse(self.tree.order))
+        rows = np.full(len(order), -1)
+        rows[order[asked]] = np.arange(len(asked))
+        return CSRRows.empty(len(order)).replaced(rows, CSRRows.vstack(parts))
 
-    def average_into(
-        self,
-        out: np.ndarray,  # (N, K) float32
-        codes: CSRRows,  # N rows of K classes, float32 in [0, 1]
-        weights: np.ndarray,  # (N,) float32 in [0, 1], or bool
-        wanted: np.ndarray,  # (N,) bool
-    ) -> np.ndarray:
-        """Replace the rows wanted by mean codes, as in `mean_codes`, where there are any; tell which, (N,) bool."""
-        asked, means_of = self._asked(codes, weights, wanted)
-        changed = np.zeros(len(out), bool)
-        means_of(asked, self.tree.order[asked], out, changed)
-        return changed
-
-    def _asked(
-        self, codes: CSRRows, weights: np.ndarray, wanted: np.ndarray
-    ) -> tuple[np.ndarray, Callable[[np.ndarray, np.ndarray, np.ndarray, np.ndarray], None]]:
-        """Find the places in the tree that are wanted; returns them, and `average` but for its last four arguments."""
+    def _prepared(
+        self, codes: CSRRows, weights: np.ndarray, selected: np.ndarray
+    ) -> Callable[[np.ndarray, np.ndarray], None]:
+        """Bring codes and weights into the order of the tree; returns `average` but for its last two arguments."""
         order = self.tree.order
-        selected = wanted[order]
         # In the order of the tree, neighbours lie beside each other.
         ordered, weights = codes.take(order), weights[order]
         units = np.repeat(weights * np.float32(1 / CODE_UNIT), np.diff(ordered.indptr))
@@ -123,8 +116,7 @@ class Neighbours:
         self.look_for(selected)
         empty = nodes_without(counted, len(self.tree.blocks))
         below = np.nextafter(self.radii, np.float32(-np.inf))
-        means_of = partial(average, self.tree, rows, counted, empty, self.radii, below, self.k)
-        return np.flatnonzero(selected).astype(np.int32), means_of
+        return partial(average, self.tree, rows, counted, empty, self.radii, below, self.k)
 
 
 def neighbour_weights(known: np.ndarray, evidence: np.ndarray) -> np.ndarray:  # (N,) bool, (N,) px
@@ -160,10 +152,9 @@ def average(
     empty: np.ndarray,  # (2 L,) int32: 1 for nodes of which no point counts
     radii: np.ndarray, below: np.ndarray,  # (n,): squared distance to the k-th nearest other; the next smaller float32
     k: int,
-    places: np.ndarray, rows: np.ndarray,  # (M,) int32, ascending; (M,) int32 of `out`
-    out: np.ndarray, changed: np.ndarray,  # (R, K) float32, (R,) bool
+    places: np.ndarray, out: np.ndarray,  # (M,) int32, ascending; (M, K) float32
 ) -> None:  # fmt: skip
-    """Write mean codes of the k nearest others that count; rows of those of which none does stay as they are.
+    """Write mean codes of the k nearest others that count; rows of places of which none does stay as they are.
 
     Those exactly at the radius share the places that are left.
     """
@@ -201,9 +192,8 @@ def average(
                 for c in range(num_classes):
                     total += sums[0, c] + share * sums[1, c]
                 if total > 0:
-                    changed[rows[q]] = True
                     for c in range(num_classes):
-                        out[rows[q], c] = (sums[0, c] + share * sums[1, c]) / total
+                        out[q, c] = (sums[0, c] + share * sums[1, c]) / total
             begin = end
 
 

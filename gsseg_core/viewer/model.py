@@ -9,6 +9,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from gsseg_core.csr_rows import CSRRows
 from gsseg_core.data.class_names import BACKGROUND_NAME, class_name
 from gsseg_core.data.object_tree import ObjectTree
 from gsseg_core.errors import UnknownLabelError
@@ -58,14 +59,14 @@ def at_level(objects: Labelling, tree: ObjectTree, granularity: float) -> Labell
     of_added = range(len(tree), len(tree) + added)
     if granularity == tree.level:
         return objects._replace(nodes=(*range(k), *of_added)) if added else objects
-    shares, nodes = tree.shares_at(granularity, objects.probabilities[:, :k], tree.leaves)
+    shares, nodes = tree.shares_at(granularity, CSRRows.from_dense(objects.probabilities[:, :k]), tree.leaves)
     of_tree, first = objects.labels < k, len(nodes)
     node = tree.labels_at(granularity, np.where(of_tree, objects.labels, 0))
     place = np.where(node >= 0, np.searchsorted(nodes, node), node)
     names = tree.names(objects.class_names)
     return Labelling(
         np.where(of_tree, place, objects.labels - k + first).astype(np.int32),
-        np.concatenate([shares, objects.probabilities[:, k:]], axis=1),
+        np.concatenate([shares.dense(first), objects.probabilities[:, k:]], axis=1),
         dict(enumerate([*(names[one] for one in nodes), *(objects.class_names[k + i] for i in range(added))])),
         (*nodes, *of_added),
     )

@@ -12,6 +12,7 @@ from typing import Any
 
 import numpy as np
 
+from gsseg_core.csr_rows import CSRRows
 from gsseg_core.data.class_names import class_name
 from gsseg_core.data.object_tree import ObjectTree
 from gsseg_core.data.view import View
@@ -192,13 +193,11 @@ class ViewerState:
             objects, tree, read = self.objects, self.model.tree, self.model.read
             ids = self.model.ids() if tree is None else at_level(objects, tree, tree.level).nodes
         labels, probabilities, names, _ = objects
-        nothing, none = np.zeros(len(labels), bool), np.empty((0, probabilities.shape[1]), np.float32)
-        result = Segmentation(labels, completed(probabilities), names, self.model.scene.digest, nothing, none)
+        shares, nothing = CSRRows.from_dense(completed(probabilities)), np.zeros(len(labels), bool)
+        result = Segmentation(labels, shares, names, self.model.scene.digest, nothing, CSRRows.empty(0))
         if read is not None:  # What blends into views is what was learnt, but for what was corrected.
-            added = len(names) - len(read.class_names)
-            before, learnt = (np.pad(shares, ((0, 0), (0, added))) for shares in (read.probabilities, read.learnt))
-            same = (probabilities == before).all(axis=1)
-            learnt = learnt[same[read.clustered]]
+            same = (probabilities == read.shares.dense(len(names))).all(axis=1)
+            learnt = read.learnt.take(np.flatnonzero(same[read.clustered]))
             result = replace(result, clustered=read.clustered & same, learnt=learnt, temperature=read.temperature)
         # Classes that were added are in no tree.
         result = replace(result, tree=tree) if ids is None else result.with_ids(ids)

@@ -7,6 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from gsseg_core.csr_rows import CSRRows
 from gsseg_core.data.object_tree import OBJECT, PART, WHOLE, ObjectTree
 from gsseg_core.errors import SettingsError
 from gsseg_core.files.npz_files import UnfitError
@@ -54,12 +55,12 @@ def test_gaussians_follow_their_class_where_it_is_another_than_their_leafs() -> 
 def test_shares_go_to_the_own_part_and_of_other_objects_to_the_largest() -> None:
     shares = np.array([[0, 0.75, 0.25, 0], [0, 0.25, 0.75, 0], [0, 1, 0, 0]], np.float32)
     leaves = np.array([5, 2, 4], np.int32)
-    fine, nodes = tree().shares_at(0.9, shares, leaves)
+    fine, nodes = tree().shares_at(0.9, CSRRows.from_dense(shares), leaves)
     assert nodes == [0, 2, 3, 4, 5]
-    np.testing.assert_allclose(fine, [[0, 0.25, 0, 0, 0.75], [0, 0.75, 0, 0.25, 0], [0, 0, 0, 1, 0]])
-    whole, nodes = tree().shares_at(0.1, shares, leaves)
+    np.testing.assert_allclose(fine.dense(5), [[0, 0.25, 0, 0, 0.75], [0, 0.75, 0, 0.25, 0], [0, 0, 0, 1, 0]])
+    whole, nodes = tree().shares_at(0.1, CSRRows.from_dense(shares), leaves)
     assert nodes == [0, 3, 6]
-    np.testing.assert_allclose(whole, [[0, 0, 1]] * 3)
+    np.testing.assert_allclose(whole.dense(3), [[0, 0, 1]] * 3)
 
 
 @pytest.mark.parametrize(
@@ -138,7 +139,8 @@ def test_the_level_of_the_objects_is_the_objects_and_each_granularity_cuts_other
 def test_shares_keep_their_sum_and_labels_are_their_nodes(tree: ObjectTree, granularity: float) -> None:
     classes = tree._classes[tree.leaves]
     shares = np.eye(tree.num_classes, dtype=np.float32)[classes]
-    at, nodes = tree.shares_at(granularity, shares, tree.leaves)
+    rows, nodes = tree.shares_at(granularity, CSRRows.from_dense(shares), tree.leaves)
+    at = rows.dense(len(nodes))
     np.testing.assert_allclose(at.sum(axis=1), 1)
     np.testing.assert_array_equal(np.array(nodes)[at.argmax(axis=1)], tree.labels_at(granularity, classes))
 

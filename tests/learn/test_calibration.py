@@ -136,7 +136,7 @@ def test_votes_without_a_view_are_those_of_a_learner_that_never_saw_it() -> None
     learner = fitted(VoteLearner)
     before = learner._votes.copy()
     others = taught(VoteLearner(SCENE, NUM_CLASSES), VIEWS[1:]).fit()
-    np.testing.assert_array_equal(learner.vote_codes_without(VIEWS[0].name), others.codes_)
+    np.testing.assert_array_equal(learner.vote_rows_without(VIEWS[0].name).dense(NUM_CLASSES), others.codes_)
     np.testing.assert_array_equal(learner._votes, before)
 
 
@@ -200,7 +200,7 @@ def test_calibration_keeps_labels_and_pictures_and_changes_confidences() -> None
         one, two = raw.render(operator), result.render(operator)
         np.testing.assert_array_equal(one.labels, two.labels)
         np.testing.assert_allclose(tempered(raw.blend(operator), 0.5).max(axis=2), two.confidence, atol=1e-5)
-    assert raw.calibrated(1.0).probabilities is raw.probabilities
+    assert raw.calibrated(1.0).shares is raw.shares
     np.testing.assert_allclose(result.calibrated(1.0).probabilities, raw.probabilities, atol=1e-6)
 
 

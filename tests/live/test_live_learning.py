@@ -34,7 +34,7 @@ def test_learning_gives_what_the_learner_gives_on_the_same_views() -> None:
     session, learner = fed(LiveSession(SCENE, NAMES), views), taught(EMLearner(SCENE, NUM_CLASSES), views).fit()
     told: list[tuple[str, int, int, float]] = []
     outcome = session.learn(report=lambda *what: told.append(what))
-    np.testing.assert_array_equal(outcome.learnt.codes, learner.codes_)
+    np.testing.assert_array_equal(outcome.learnt.codes.dense(NUM_CLASSES), learner.codes_)
     np.testing.assert_array_equal(outcome.learnt.evidence, learner.evidence())
     refined = Segmentation.from_codes(SCENE, learner.codes_, NAMES, evidence=learner.evidence())
     np.testing.assert_array_equal(session.segmentation(UNCARVED).labels, refined.labels)
@@ -49,7 +49,7 @@ def test_after_learning_its_codes_hold_and_votes_speak_for_the_gaussians_that_it
     labels[:, 20:] = UNKNOWN
     views = [View.from_arrays(VIEWS[0].camera, labels), *VIEWS[1:]]
     session = fed(LiveSession(SCENE, NAMES), views[:1])
-    learnt = session.learn().learnt.codes
+    learnt = session.learn().learnt.codes.dense(NUM_CLASSES)
     fed(session, views[1:])
     votes, codes = fed(LiveSession(SCENE, NAMES), views).codes(), session.codes()
     known = learnt.any(axis=1)
@@ -74,7 +74,7 @@ def test_what_an_older_version_has_learnt_comes_without_its_evidence_and_all_nei
     np.savez(tmp_path / "state.npz", **arrays)
     restored.load(tmp_path / "state.npz")
     assert restored.learnt.evidence is None
-    refined = Segmentation.from_codes(SCENE, learnt.codes, NAMES)
+    refined = Segmentation.from_codes(SCENE, learnt.codes.dense(NUM_CLASSES), NAMES)
     np.testing.assert_array_equal(restored.segmentation(UNCARVED).labels, refined.labels)
     for wrong in (
         np.full(len(SCENE), np.nan, np.float32),
@@ -91,7 +91,7 @@ def test_learning_from_a_folder_takes_its_train_views_and_its_names(tmp_path: Pa
     session = LiveSession(SCENE)
     outcome = session.learn(dataset=data)
     expected = taught(EMLearner(SCENE, NUM_CLASSES), data.views("train")).fit().codes_
-    np.testing.assert_array_equal(outcome.learnt.codes, expected)
+    np.testing.assert_array_equal(outcome.learnt.codes.dense(NUM_CLASSES), expected)
     assert session.class_names == NAMES and session.num_fused == 0 and session.has_codes
     assert session.learn(dataset=data, num_views=2).learnt.num_views == 2
     assert session.learn(dataset=data, max_steps=1).num_steps == 1

@@ -18,6 +18,7 @@ from small_scenes import (
 )
 
 from gsseg_core.cli.main import main
+from gsseg_core.csr_rows import CSRRows
 from gsseg_core.data.dataset import Dataset
 from gsseg_core.data.label_images import UNKNOWN
 from gsseg_core.data.view import View
@@ -47,7 +48,7 @@ def test_a_live_session_finds_the_objects_as_views_arrive_and_repairs_them_when_
     for view in [in_halves(VIEWS[0], 1), *VIEWS[1:]]:
         assert session.fuse(shuffled(view)) is None
     assert session.class_names[4] == "object_004"
-    codes = session.learn().learnt.codes
+    codes = session.learn().learnt.codes.dense(session._live.num_classes)
     assert session.num_views == 6 and session.num_fused == 8
     true = EMLearner(SCENE, NUM_CLASSES)
     for view in VIEWS[2:]:
@@ -128,7 +129,7 @@ def test_a_repair_keeps_the_calibration_of_what_was_learnt() -> None:
     session = PerViewSession(SCENE)
     for view in [in_halves(VIEWS[0], 1), *VIEWS[1:]]:
         session.fuse(shuffled(view))
-    session._learnt = Learnt("em", session.codes(), 5, temperature=1.7)
+    session._learnt = Learnt("em", CSRRows.from_dense(session.codes()), 5, temperature=1.7)
     repair = session.repair()
     assert (repair.successors != np.arange(len(repair.successors))).any(), "something was repaired"
     assert session.learnt is not None and (session.learnt.temperature, session.learnt.num_views) == (1.7, 5)
@@ -155,7 +156,7 @@ def test_objects_that_are_repaired_while_they_are_learnt_keep_what_was_learnt_of
     after.learn("votes")
     come(after)
     assert session.learnt is not None and after.learnt is not None
-    np.testing.assert_array_equal(session.learnt.codes, after.learnt.codes)
+    np.testing.assert_array_equal(session.learnt.codes.data, after.learnt.codes.data)
 
 
 def test_in_a_live_session_a_view_of_a_name_that_is_kept_takes_its_place() -> None:

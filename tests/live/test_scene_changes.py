@@ -32,6 +32,7 @@ from gsseg_core.segmentation import Segmentation
 
 SCENE, TRUTH = balls_on_a_table()
 VIEWS = clean_views(4)
+K = len(NAMES)
 ARRAYS = ("means", "quats", "scales", "opacities", "sh")
 FAR = Similarity(1.5, Rotation.from_rotvec([0.2, -0.1, 0.4]).as_matrix(), np.array([40.0, 3.0, -2.0]))
 
@@ -148,7 +149,7 @@ def test_what_was_learnt_goes_along_with_its_gaussians_also_while_it_is_learnt()
     growing.learn("votes")
     learnt = growing.learnt
     growing.update(SceneDelta(removed=np.array([5])))
-    np.testing.assert_array_equal(growing.learnt.codes, np.delete(learnt.codes, 5, axis=0))
+    np.testing.assert_array_equal(growing.learnt.codes.dense(K), np.delete(learnt.codes.dense(K), 5, axis=0))
     np.testing.assert_array_equal(growing.learnt.evidence, np.delete(learnt.evidence, 5))
 
     def remove_once(*_: object) -> None:
@@ -156,14 +157,14 @@ def test_what_was_learnt_goes_along_with_its_gaussians_also_while_it_is_learnt()
             growing.update(SceneDelta(removed=np.array([6])))
 
     outcome = growing.learn("votes", report=remove_once)
-    assert len(outcome.learnt.codes) == len(growing.scene) == len(SCENE) - 2
+    assert outcome.learnt.codes.num_rows == len(growing.scene) == len(SCENE) - 2
     assert len(growing.segmentation().labels) == len(growing.scene)
 
 
 def test_a_gaussian_that_takes_the_id_of_a_removed_one_while_it_is_learnt_gets_nothing_of_that() -> None:
     growing, again = session(), other_room((0, 0, 9))
     growing.learn("votes")
-    seen = int(growing.learnt.codes.any(axis=1).argmax())
+    seen = int(growing.learnt.codes.dense(K).any(axis=1).argmax())
     one = SCENE.subset(np.array([seen]))
 
     def take_the_place(*_: object) -> None:
@@ -171,7 +172,7 @@ def test_a_gaussian_that_takes_the_id_of_a_removed_one_while_it_is_learnt_gets_n
             growing.update(SceneDelta(removed=np.array([seen])))
             growing.update(replace(again, added=one, added_ids=np.array([seen]), added_groups=np.zeros(1, np.int64)))
 
-    codes = growing.learn("votes", report=take_the_place).learnt.codes
+    codes = growing.learn("votes", report=take_the_place).learnt.codes.dense(K)
     assert growing.living.ids[-1] == seen and not codes[-1].any() and codes[:-1].any()
 
 
@@ -362,7 +363,7 @@ def test_a_state_saved_before_a_file_in_another_order_loads_after_it_to_its_gaus
     for view in VIEWS:
         shuffled.fuse(view)
     shuffled.learn("votes")
-    forgotten, learnt = votes(shuffled) - as_refused(shuffled), shuffled.learnt.codes
+    forgotten, learnt = votes(shuffled) - as_refused(shuffled), shuffled.learnt.codes.dense(K)
     shuffled.save(tmp_path / "state.npz")
     rng, origin, file = np.random.default_rng(0), np.arange(len(SCENE)), SCENE
     for ids in (None, rng.permutation(len(SCENE) - 50) if with_ids else None):
@@ -372,7 +373,7 @@ def test_a_state_saved_before_a_file_in_another_order_loads_after_it_to_its_gaus
         shuffled.replace_scene(file)
     shuffled.load(tmp_path / "state.npz")
     np.testing.assert_array_equal(votes(shuffled) - as_refused(shuffled), forgotten[origin])
-    np.testing.assert_array_equal(shuffled.learnt.codes, learnt[origin])
+    np.testing.assert_array_equal(shuffled.learnt.codes.dense(K), learnt[origin])
     assert forgotten.any() and learnt.any()
 
 

@@ -1,7 +1,6 @@
 from __future__ import annotations
 
 import doctest
-import tracemalloc
 from typing import NamedTuple
 
 import numba as nb
@@ -11,9 +10,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
+from gsseg_core.csr_rows import CSRRows
 from gsseg_core.errors import SettingsError
 from gsseg_core.refine import knn_filter as refine
-from gsseg_core.refine.knn_filter import before_clustering, cluster_in_place, statistical_filter
+from gsseg_core.refine.knn_filter import before_clustering, statistical_filter
 from gsseg_core.refine.settings import RefineSettings
 from gsseg_core.scene.gaussian_scene import GaussianScene
 from gsseg_core.spatial import class_distances as class_distances_module
@@ -26,13 +26,13 @@ class Clustered(NamedTuple):
     changed: np.ndarray
 
 
-def cluster(means, probabilities, observed, *settings, **named):
-    codes = probabilities.copy()
-    return Clustered(codes, cluster_in_place(means, codes, observed, *settings, **named)[0])
+def cluster(means, probabilities, *settings, **named):
+    rows, changed = refine.cluster(means, CSRRows.from_dense(probabilities), probabilities.shape[1], *settings, **named)
+    return Clustered(rows.dense(probabilities.shape[1]), changed)
 
 
 def slow_cluster(means, probabilities, each_weighs, k, beta):
-    """Readable twin of `cluster_in_place`."""
+    """Readable twin of `cluster`."""
     refined, changed = probabilities.astype(np.float64), np.zeros(len(means), bool)
     k = min(k, len(means) - 1)
     for i in range(len(means) if k else 0):
@@ -68,19 +68,21 @@ def scene(seed, n, num_classes=5, on_grid=False):
     rng = np.random.default_rng(seed)
     means = rng.integers(-4, 5, (n, 3)) if on_grid else rng.normal(size=(n, 3)) * rng.choice([0.1, 1, 5], (n, 1))
     probabilities = rng.dirichlet(np.full(num_classes, 0.3), n).astype(np.float32)
-    return means.astype(np.float32), probabilities, rng.random(n) < 0.8, rng.integers(-2, num_classes, n, np.int32)
+    observed = rng.random(n) < 0.8
+    probabilities[~observed] = 0
+    return means.astype(np.float32), probabilities, observed, rng.integers(-2, num_classes, n, np.int32)
 
 
 @pytest.mark.parametrize("on_grid", [False, True])
 @pytest.mark.parametrize(("n", "k"), [(1, 1), (7, 50), (40, 3), (300, 1), (300, 16), (1500, 50)])
 def test_both_steps_agree_with_their_slow_twins(n, k, on_grid):
     means, probabilities, observed, labels = scene(n + k, n, on_grid=on_grid)
-    result = cluster(means, probabilities, observed, k, 0.65)
+    result = cluster(means, probabilities, k, 0.65)
     expected, changed = slow_cluster(means, probabilities, observed, k, 0.65)
     np.testing.assert_allclose(result.probabilities, expected, atol=1e-6)
     np.testing.assert_array_equal(result.changed, changed)
     evidence = np.random.default_rng(k).exponential(2, n)
-    result = cluster(means, probabilities, observed, k, 0.65, evidence=evidence)
+    result = cluster(means, probabilities, k, 0.65, evidence=evidence)
     weights = observed * np.maximum(evidence / (evidence + HALF), 2.0**-10)
     expected, changed = slow_cluster(means, probabilities, weights, k, 0.65)
     np.testing.assert_allclose(result.probabilities, expected, atol=1e-5)
@@ -91,13 +93,13 @@ def test_both_steps_agree_with_their_slow_twins(n, k, on_grid):
 @settings(max_examples=15)
 @given(seed=st.integers(0, 10**6), n=st.integers(1, 400), k=st.integers(1, 60), on_grid=st.booleans())
 def test_order_of_gaussians_and_number_of_threads_change_no_bit(seed, n, k, on_grid):
-    means, probabilities, observed, labels = scene(seed, n, on_grid=on_grid)
-    result, removed = cluster(means, probabilities, observed, k), statistical_filter(means, labels, k)
+    means, probabilities, _, labels = scene(seed, n, on_grid=on_grid)
+    result, removed = cluster(means, probabilities, k), statistical_filter(means, labels, k)
     shuffled = np.random.default_rng(seed).permutation(n)
     threads = nb.get_num_threads()
     nb.set_num_threads(1)
     try:
-        again = cluster(means[shuffled], probabilities[shuffled], observed[shuffled], k)
+        again = cluster(means[shuffled], probabilities[shuffled], k)
         removed_again = statistical_filter(means[shuffled], labels[shuffled], k)
     finally:
         nb.set_num_threads(threads)
@@ -109,10 +111,10 @@ def test_order_of_gaussians_and_number_of_threads_change_no_bit(seed, n, k, on_g
 @settings(max_examples=15)
 @given(seed=st.integers(0, 10**6))
 def test_a_rigid_motion_changes_nothing(seed):
-    means, probabilities, observed, labels = scene(seed, 300)
+    means, probabilities, _, labels = scene(seed, 300)
     rotation = Rotation.random(random_state=seed).as_matrix()
     moved = (means.astype(np.float64) @ rotation.T + [0.3, -2, 1]).astype(np.float32)
-    before, after = cluster(means, probabilities, observed, 10), cluster(moved, probabilities, observed, 10)
+    before, after = cluster(means, probabilities, 10), cluster(moved, probabilities, 10)
     # Rounding of the positions may swap neighbours that are all but tied, of one Gaussian in hundreds.
     same = np.isclose(before.probabilities, after.probabilities, atol=1e-5).all(axis=1)
     assert same.sum() >= len(same) - 2
@@ -122,7 +124,7 @@ def test_a_rigid_motion_changes_nothing(seed):
 
 def test_sure_gaussians_keep_their_codes_and_rows_sum_to_one():
     means, probabilities, observed, _ = scene(0, 2000)
-    result = cluster(means, probabilities, observed, 50, 0.65)
+    result = cluster(means, probabilities, 50, 0.65)
     np.testing.assert_array_equal(result.changed, ~observed | (probabilities.max(axis=1) < 0.65))
     np.testing.assert_array_equal(result.probabilities[~result.changed], probabilities[~result.changed])
     np.testing.assert_allclose(result.probabilities.sum(axis=1), 1, atol=1e-6)
@@ -154,23 +156,19 @@ def test_only_what_lies_near_a_changed_label_is_found_anew():
     assert 0 < found.sum() < 100
 
 
-def test_the_rows_that_changed_come_back_as_they_were():
-    means, probabilities, observed, _ = scene(3, 700)
-    changed, before = cluster_in_place(means, probabilities.copy(), observed, 20, 0.65)
-    assert changed.any() and not changed.all()
-    np.testing.assert_array_equal(before, probabilities[changed])
-
-
-def test_unobserved_codes_are_never_read():
-    means, probabilities, observed, _ = scene(1, 500)
-    probabilities[~observed] = np.nan
-    assert np.isfinite(cluster(means, probabilities, observed, 10).probabilities).all()
+def test_the_codes_given_stay_as_they_were():
+    means, probabilities, _, _ = scene(3, 700)
+    kept = probabilities.copy()
+    result = cluster(means, probabilities, 20, 0.65)
+    assert result.changed.any() and not result.changed.all()
+    np.testing.assert_array_equal(probabilities, kept)
 
 
 @pytest.mark.parametrize(("n", "seen"), [(0, False), (1, False), (60, False), (1, True), (60, True)])
 def test_nothing_changes_where_all_are_unobserved_or_all_are_sure(n, seen):
     means, probabilities, _, _ = scene(2, n)
-    result = cluster(means, probabilities, np.full(n, seen), 50, beta=0.0)
+    probabilities = np.random.default_rng(2).dirichlet(np.ones(5), n).astype(np.float32) * np.float32(seen)
+    result = cluster(means, probabilities, 50, beta=0.0)
     assert not result.changed.any()
     np.testing.assert_array_equal(result.probabilities, probabilities)
 
@@ -199,7 +197,7 @@ def test_gaussians_at_one_position_and_equal_spacings_stay(position):
     corners = np.eye(3, dtype=np.float32) * 0.1 + np.float32(position)
     assert not statistical_filter(corners, np.ones(3, np.int32), sigmas=0.0).any()
     _, probabilities, observed, _ = scene(5, 5000)
-    result = cluster(same, probabilities, observed)
+    result = cluster(same, probabilities)
     total = probabilities[observed].sum(axis=0, dtype=np.float64)
     own = np.where(observed[:, None], probabilities, 0)
     expected = (total - own) / (observed.sum() - observed)[:, None]
@@ -209,21 +207,22 @@ def test_gaussians_at_one_position_and_equal_spacings_stay(position):
 def test_what_is_far_from_all_that_was_observed_stays_unobserved():
     means, probabilities, _, _ = scene(7, 400)
     observed = np.arange(400) < 200
+    probabilities = np.random.default_rng(7).dirichlet(np.ones(5), 400).astype(np.float32) * observed[:, None]
     means[~observed] += 1e4
-    result = cluster(means, probabilities, observed, 20)
+    result = cluster(means, probabilities, 20)
     assert not result.changed[~observed].any() and result.changed[observed].any()
     np.testing.assert_array_equal(result.probabilities[~observed], probabilities[~observed])
 
 
 def test_neighbours_are_found_once_per_scene_and_give_the_same_result():
-    means, probabilities, observed, labels = scene(8, 600)
+    means, probabilities, _, labels = scene(8, 600)
     given_scene = GaussianScene.from_arrays(
         means, np.tile([1.0, 0, 0, 0], (600, 1)), np.ones((600, 3)), np.full(600, 0.5), np.zeros((600, 1, 3))
     )
     neighbours = neighbours_of(given_scene, 20)
     assert neighbours_of(given_scene, 20) is neighbours and neighbours_of(given_scene, 21) is not neighbours
-    with_them = cluster(means, probabilities, observed, 20, neighbours=neighbours)
-    np.testing.assert_array_equal(with_them.probabilities, cluster(means, probabilities, observed, 20).probabilities)
+    with_them = cluster(means, probabilities, 20, neighbours=neighbours)
+    np.testing.assert_array_equal(with_them.probabilities, cluster(means, probabilities, 20).probabilities)
     removed = statistical_filter(means, labels, 20, neighbours=neighbours)
     np.testing.assert_array_equal(removed, statistical_filter(means, labels, 20))
     assert neighbours_of(given_scene.subset([0]), 20) is None
@@ -254,9 +253,9 @@ def test_background_that_is_sure_of_itself_is_never_looked_for():
 
 @pytest.mark.parametrize("scale", [1e-25, 1e30])
 def test_scenes_of_any_size_give_the_same_result(scale):
-    means, probabilities, observed, labels = scene(6, 300)
+    means, probabilities, _, labels = scene(6, 300)
     means, scale = means * np.float32(2**-10), np.float32(2.0 ** np.round(np.log2(scale)))
-    scaled, plain = cluster(means * scale, probabilities, observed), cluster(means, probabilities, observed)
+    scaled, plain = cluster(means * scale, probabilities), cluster(means, probabilities)
     np.testing.assert_array_equal(scaled.probabilities, plain.probabilities)
     np.testing.assert_array_equal(statistical_filter(means * scale, labels), statistical_filter(means, labels))
 
@@ -277,7 +276,7 @@ def test_examples_in_the_documentation_hold():
 
 @pytest.mark.parametrize("count", [0, 1, 40])
 def test_codes_of_before_clustering_are_those_learnt_and_where_there_were_none_the_new_ones(
-    count: int, monkeypatch: pytest.MonkeyPatch
+    count: int,
 ) -> None:
     rng = np.random.default_rng(count)
     codes, clustered = rng.dirichlet(np.ones(5), count).astype(np.float32), rng.random(count) < 0.5
@@ -285,18 +284,5 @@ def test_codes_of_before_clustering_are_those_learnt_and_where_there_were_none_t
     learnt[::2] = 0
     expected = codes.copy()
     expected[clustered] = np.where(learnt.any(axis=1, keepdims=True), learnt, codes[clustered])
-    for rows in (7, 4096):
-        monkeypatch.setattr(refine, "_ROWS", rows)
-        np.testing.assert_array_equal(before_clustering(codes, clustered, learnt).dense(5), expected)
-
-
-def test_codes_of_before_clustering_take_no_memory_for_all_gaussians() -> None:
-    codes, clustered = np.zeros((40_000, 100), np.float32), np.zeros(40_000, bool)
-    codes[:, 3], clustered[::3] = 1, True
-    learnt = codes[clustered]
-    before_clustering(codes, clustered, learnt)  # Its kernels are there.
-    tracemalloc.start()
-    before_clustering(codes, clustered, learnt)
-    peak = tracemalloc.get_traced_memory()[1]
-    tracemalloc.stop()
-    assert peak < codes.nbytes / 2
+    found = before_clustering(CSRRows.from_dense(codes), clustered, CSRRows.from_dense(learnt))
+    np.testing.assert_array_equal(found.dense(5), expected)

@@ -14,6 +14,7 @@ from hypothesis import strategies as st
 from parts_of_balls import tree_of_balls
 from small_scenes import NUM_CLASSES, balls_on_a_table, look_at
 
+from gsseg_core.csr_rows import CSRRows
 from gsseg_core.data.object_tree import ObjectTree
 from gsseg_core.report.preview import RECORD, look_from, make_preview, up_of
 from gsseg_core.scene.gaussian_scene import GaussianScene
@@ -26,7 +27,8 @@ def result_of(labels: np.ndarray, scene: GaussianScene = SCENE) -> Segmentation:
     codes = np.eye(NUM_CLASSES, dtype=np.float32)[np.maximum(labels, 0)] * 0.75
     names = {k: str(k) for k in range(NUM_CLASSES)}
     none = np.zeros(len(labels), bool)
-    return Segmentation(labels.astype(np.int32), codes, names, scene.digest, none, codes[none])
+    rows = CSRRows.from_dense(codes)
+    return Segmentation(labels.astype(np.int32), rows, names, scene.digest, none, CSRRows.empty(0))
 
 
 def test_preview_reads_back_to_half_a_step_and_marks_what_has_no_class() -> None:
@@ -73,7 +75,7 @@ def test_a_preview_by_part_is_that_of_the_finest_level() -> None:
     codes = rng.dirichlet(np.ones(NUM_CLASSES), len(SCENE)).astype(np.float32)
     labels = TRUTH.copy()
     labels[::50], labels[1::50] = UNOBSERVED, REMOVED
-    result = replace(result_of(labels), probabilities=codes, tree=tree_of_balls()).calibrated(0.6)
+    result = replace(result_of(labels), shares=CSRRows.from_dense(codes), tree=tree_of_balls()).calibrated(0.6)
     fine = result.at(1.0)
     for most in (500, len(SCENE)):
         found, expected = make_preview(SCENE, result, most, parts=True).records, make_preview(SCENE, fine, most).records
@@ -94,7 +96,8 @@ def test_a_preview_by_part_takes_no_memory_for_the_parts_of_all_gaussians() -> N
     codes, none = np.eye(classes, dtype=np.float32)[labels], np.zeros(count, bool)
     names = {k: str(k) for k in range(classes)}
     tree = ObjectTree(parents, agreement, leaves, classes, 0.5)
-    result = Segmentation(labels, codes, names, scene.digest, none, codes[none], 0.6, tree=tree)
+    rows = CSRRows.from_dense(codes)
+    result = Segmentation(labels, rows, names, scene.digest, none, CSRRows.empty(0), 0.6, tree=tree)
     tracemalloc.start()
     preview = make_preview(scene, result, 500, parts=True)
     peak = tracemalloc.get_traced_memory()[1]

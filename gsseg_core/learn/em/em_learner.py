@@ -208,7 +208,7 @@ class EMLearner(Learner):
             if self.converged_:
                 break
         progress("em", settings.max_steps, settings.max_steps)
-        self.codes_, self.error_models_ = codes.dense(self.num_classes), models
+        self.code_rows_, self.error_models_ = codes.nonzero(), models
         self._finish()
         return self
 
