@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 from small_scenes import HEIGHT, NAMES, NUM_CLASSES, WIDTH, balls_on_a_table, clean_views, ring, taught
 
+from gsseg_core import csr_rows
 from gsseg_core.data.view import View
 from gsseg_core.errors import GssegError, MaskFormatError, MaskSizeError, StateFileError, UnknownLabelError
 from gsseg_core.files import npz_files
@@ -206,6 +207,43 @@ def test_an_array_is_read_no_further_than_its_header_says(saved: Path) -> None:
 def test_arrays_beyond_the_limit_of_a_file_are_refused(saved: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(npz_files, "LIMITS", Limits(max_npz_bytes=1000))
     assert_refused_in_little_memory(lambda: Segmentation.load(saved, SCENE), StateFileError, "max_npz_bytes", "1,000")
+
+
+@pytest.mark.parametrize("order", ["C", "F"])
+@pytest.mark.parametrize("entries", [1, 20, 1 << 22])
+def test_sparse_rows_are_read_and_written_as_numpy_does_it_with_their_zeros(
+    tmp_path: Path, order: Any, entries: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(csr_rows, "_AT_A_TIME", entries)
+    array = np.asarray(np.random.default_rng(0).integers(0, 3, (30, 7)).astype(np.float32), order=order)
+    arrays = {"full": array, "none": np.zeros((0, 7), np.float32)}
+    np.savez_compressed(tmp_path / "numpy.npz", **arrays)
+    with npz_files.open_arrays(tmp_path / "numpy.npz", "arrays", StateFileError) as file:
+        read = {name: file.expect_rows(name, np.float32, (None, 7)) for name in arrays}
+        with pytest.raises(
+            npz_files.UnfitError, match=r"array full is float32 of shape \(30, 7\); expected .*\(9, 7\)"
+        ):
+            file.expect_rows("full", np.float32, (9, 7))
+    written = {name: npz_files.WithZeros(rows, 7) for name, rows in read.items()}
+    npz_files.write_arrays(tmp_path / "ours.npz", {}, **written)
+    with np.load(tmp_path / "ours.npz") as file:
+        for name, expected in arrays.items():
+            np.testing.assert_array_equal(read[name].dense(7), expected)
+            assert file[name].dtype == np.float32
+            np.testing.assert_array_equal(file[name], expected)
+
+
+@pytest.mark.parametrize(("change", "part"), [(-4, "shorter"), (4, "longer")])
+def test_sparse_rows_that_end_elsewhere_than_their_header_says_are_refused(saved: Path, change: int, part: str) -> None:
+    with zipfile.ZipFile(saved) as file:
+        members = {member: file.read(member) for member in file.namelist()}
+    members["probabilities.npy"] = (members["probabilities.npy"] + bytes(4))[
+        : len(members["probabilities.npy"]) + change
+    ]
+    with zipfile.ZipFile(saved, "w") as file:
+        for member, content in members.items():
+            file.writestr(member, content)
+    assert_refused_in_little_memory(lambda: Segmentation.load(saved, SCENE), StateFileError, f"{part} than its header")
 
 
 @pytest.mark.parametrize("order", ["C", "F"])
