@@ -217,21 +217,21 @@ def _merge(shares: np.ndarray, segments: _Segments) -> tuple[list[_Region], np.n
 
 def _kept(regions: Sequence[_Region], showing: np.ndarray, objects: Sequence[_Region] = ()) -> list[_Region]:
     """Keep of all regions what several views show; `objects`, for the first regions, are kept in any case."""
-    kept, waiting = dict[int, list[_Region]](), dict[int, np.ndarray]()
+    sets = [int.from_bytes(row.tobytes(), "big") for row in np.packbits(showing, axis=1)]  # of views, a bit for each
+    kept, waiting = dict[int, list[_Region]](), dict[int, int]()
     for region in regions:
         found = [(kept.pop(part.row), waiting.pop(part.row)) for part in region.parts]
-        parts, views = [one for each, _ in found for one in each], showing[region.row]
-        alive = [few for each, few in found if each or few.any()]
+        parts, views = [one for each, _ in found for one in each], sets[region.row]
+        alive = [few for each, few in found if each or few]
         if len(alive) == 1:  # Then it is the same but for a rim, and views that show the one mean the other as well.
-            views = views | alive[0]
-        shown, nobody = np.count_nonzero(views) >= SEVERAL, np.zeros_like(views)
+            views |= alive[0]
         if region.row < len(objects):
-            kept[region.row], waiting[region.row] = [objects[region.row]], nobody
-        elif not shown:
+            kept[region.row], waiting[region.row] = [objects[region.row]], 0
+        elif views.bit_count() < SEVERAL:
             kept[region.row], waiting[region.row] = parts, views
         else:
             same = parts[0] if len(parts) == 1 else _Region(region.agreement if parts else 1.0, parts)
-            kept[region.row], waiting[region.row] = [_Region(same.agreement, same.parts, region.row)], nobody
+            kept[region.row], waiting[region.row] = [_Region(same.agreement, same.parts, region.row)], 0
     return [region for each in kept.values() for region in each]
 
 
