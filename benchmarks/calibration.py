@@ -253,7 +253,7 @@ def best_truth(bench: Bench) -> tuple[np.ndarray, np.ndarray]:
     """Learn codes (N, K) from the true masks of all views, test views too; and how many px see each Gaussian."""
     learner = EMLearner(bench.scene, max(bench.class_names) + 1, EMSettings(errors=False))
     learner.observe_all([*bench.train[CLEAN], *bench.test])
-    return learner.fit().codes_, learner._votes.sum(axis=1) * VOTE_UNIT
+    return learner.fit().codes_, learner._votes.rows().sums() * VOTE_UNIT
 
 
 def gaussian_ece(result: Segmentation, true_codes: np.ndarray, seen: np.ndarray) -> float:

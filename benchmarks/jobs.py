@@ -29,6 +29,7 @@ from gsseg_core.raster.constants import T_LIFTED, T_MIN
 from gsseg_core.raster.cpu.lifting import Lifted
 from gsseg_core.raster.cpu.projection import project
 from gsseg_core.raster.cpu.tiling import assign
+from gsseg_core.raster.vote_total import VoteTotal
 from gsseg_core.scene.gaussian_scene import GaussianScene
 from gsseg_core.segmentation import Segmentation
 from gsseg_core.warm_up import warm_up
@@ -119,7 +120,7 @@ def _lift_view(scene: GaussianScene, view: View, runs: int) -> dict[str, Any]:
     def first() -> np.ndarray:
         return first_lift(splats, tiles, local, many)
 
-    total = np.zeros((len(scene), int(mask.max()) + 1), np.int64)
+    total = VoteTotal(len(scene), int(mask.max()) + 1)
     votes = np.zeros((len(scene), many), np.float32)
     votes[observation.ids] = observation.dense(observation.votes())
     difference = float(np.abs(first() - votes[operator.ids]).sum() / votes.sum())

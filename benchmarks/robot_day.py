@@ -22,7 +22,6 @@ from collections import Counter
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
 
 os.environ["ROS_AUTOMATIC_DISCOVERY_RANGE"] = "LOCALHOST"
 sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tests/helpers"))
@@ -262,7 +261,7 @@ class Day:
         self.found.judge(what, f"{differ} of {len(scene)} differ, {len(state.views)} views", "0 differ", differ == 0)
         if not learn:
             names = {view.name for view in state.views}
-            odd = int((state.votes[:, : len(NAMES)] != _votes(fresh)).sum()) if len(names) == fresh.num_fused else -1
+            odd = int((_votes(state) != _votes(fresh._live.state())).sum()) if len(names) == fresh.num_fused else -1
             counted = f"{state.num_fused} fused, {len(state.views)} kept, {odd} votes differ"
             met = state.num_fused == len(state.views) == len(names) and odd == 0
             self.found.judge("votes of the views kept", counted, "as many, 0 differ", met)
@@ -351,9 +350,8 @@ def write_noisy_dataset(folder: Path, number: int, seed: int) -> None:
         write_mask(folder / "labels" / f"{camera.name}.png", noisy, 8)
 
 
-def _votes(session: LiveSession) -> np.ndarray:
-    votes: Any = session._live.state().votes
-    return np.asarray(votes)[:, : len(NAMES)]
+def _votes(state: State) -> np.ndarray:
+    return state.votes.dense(state.num_classes)[:, : len(NAMES)]
 
 
 def main() -> int:

@@ -24,6 +24,7 @@ from gsseg_core.raster.cpu.depth_sort import sort_by_depth
 from gsseg_core.raster.cpu.projection import project
 from gsseg_core.raster.cpu.tiling import assign
 from gsseg_core.raster.depth import depths
+from gsseg_core.raster.vote_total import VoteTotal
 from gsseg_core.refine.knn_filter import cluster, statistical_filter
 from gsseg_core.refine.settings import RefineSettings
 from gsseg_core.scene.gaussian_scene import GaussianScene
@@ -63,7 +64,7 @@ def _unlabelled(view: View) -> View:
 
 def _view_stages(scene: GaussianScene, views: list[View], num_classes: int, runs: int) -> Times:
     """Stages of one view: each run takes all of them, one after the other."""
-    total = np.zeros((len(scene), num_classes), np.int64)
+    total = VoteTotal(len(scene), num_classes)
     codes = np.random.default_rng(0).dirichlet(np.ones(num_classes), len(scene)).astype(np.float32)
     stages: dict[str, list[Callable[[], object]]] = {}
 

@@ -79,6 +79,11 @@ class CSRRows(NamedTuple):
         _unite(self, other, united, united_other.data)
         return united, united_other
 
+    def plus(self, other: CSRRows) -> CSRRows:
+        """Add two arrays; sums of zero are entries still."""
+        one, two = self.united(other)
+        return one.with_data(one.data + two.data)
+
     def normalised(self) -> CSRRows:
         """Scale each row of float32 to sum 1, in place; rows of zeros stay zero."""
         _normalise(self)

@@ -33,6 +33,7 @@ from gsseg_core.raster.backends import make_operator
 from gsseg_core.raster.cpu.occlusion import ray_ends
 from gsseg_core.raster.depth import surface
 from gsseg_core.raster.view_renderer import PixelGrid
+from gsseg_core.raster.vote_total import VoteTotal
 from gsseg_core.refine.label_propagation import propagate
 from gsseg_core.refine.settings import PAPER
 from gsseg_core.scene.camera import Camera
@@ -180,5 +181,9 @@ def refine_something(device: str = "cpu") -> None:
     quantise(np.stack([labels == 0, labels == 1]).astype(np.float32))
     rows = CSRRows.from_dense(codes)
     rows.united(rows)
-    resolved_votes(CSRRows.from_dense(np.array([[-1, 1]])), np.ones(2, bool))
+    votes, own = CSRRows.from_dense(np.array([[-1, 1]])), np.zeros(1, np.int64)
+    resolved_votes(votes, np.ones(2, bool))
+    # Votes that are saved, loaded, merged, carried over to another scene, and given to other objects.
+    moved = votes.plus(votes).replaced(own, votes).take(own).in_columns(votes.indices)
+    VoteTotal.from_rows(moved, 2).dense()
     seen_colors(basis(np.eye(3), 3), scene.means, np.arange(3, dtype=np.int32), np.zeros(3, np.float32), 0)

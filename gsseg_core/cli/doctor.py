@@ -252,7 +252,7 @@ def _devices() -> Iterator[Finding]:
 def _kernels(say: Callable[[str], object]) -> Iterator[Finding]:
     start = time.perf_counter()
     try:
-        from gsseg_core.raster.observation import add_votes
+        from gsseg_core.raster.vote_total import add_pairs
         from gsseg_core.warm_up import SIDE, warm_up
 
         warm_up(say=say)
@@ -261,10 +261,10 @@ def _kernels(say: Callable[[str], object]) -> Iterator[Finding]:
         yield Finding("kernels", "run", f"{type(error).__name__}: {error}", "!!", fix)
         return
     seconds = time.perf_counter() - start
-    compiled = "from the cache" if add_votes.stats.cache_hits else "compiled just now"
+    compiled = "from the cache" if add_pairs.stats.cache_hits else "compiled just now"
     yield Finding("kernels", "run", f"segmented {SIDE**2:,} Gaussians in {seconds:.1f} s, {compiled}")
     if kernel_cache.FOLDER:
-        yield Finding("kernels", "cache", add_votes.stats.cache_path or kernel_cache.FOLDER)
+        yield Finding("kernels", "cache", add_pairs.stats.cache_path or kernel_cache.FOLDER)
     else:
         state = f"none: cannot write to {' or '.join(kernel_cache.candidates())}"
         fix = f"{kernel_cache.REMEDY}; else every run compiles for about a minute on two cores"

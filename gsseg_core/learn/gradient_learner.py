@@ -94,7 +94,7 @@ class GradientLearner(Learner):
         """Run all epochs."""
         settings = self.settings
         self._require_views()
-        self.observed_ = is_resolved(self._votes, self._possible())
+        self.observed_ = is_resolved(self._votes.rows(), self._possible())
         codes = torch.zeros((len(self.scene), self.num_classes), requires_grad=True)
         optimiser = torch.optim.Adam([codes], lr=settings.rate)
         steps = settings.epochs * len(self.views)

@@ -16,10 +16,9 @@ from gsseg_core.data.soft_masks import SeenLabels
 from gsseg_core.data.view import View
 from gsseg_core.errors import NoUsableViewsError, SettingsError, StateMismatchError, UnknownLabelError
 from gsseg_core.files.limits import MAX_LABEL
-from gsseg_core.learn.em.em_kernels import normalise_votes, weigh_votes
 from gsseg_core.learn.learner_state import State
 from gsseg_core.learn.prepared_views import PreparedViews, default_budget
-from gsseg_core.learn.vote_resolution import impute_probabilities
+from gsseg_core.learn.vote_resolution import impute_probabilities, vote_shares, weigh_votes
 from gsseg_core.learn.whole_rays import votes_cast_anew
 from gsseg_core.progress import Progress as Progress
 from gsseg_core.progress import silent as silent
@@ -28,6 +27,7 @@ from gsseg_core.raster.backends import make_operator, vote_total
 from gsseg_core.raster.observation import Observation
 from gsseg_core.raster.view_operator import ViewOperator
 from gsseg_core.raster.view_renderer import NO_PIXELS, PixelGrid, Strongest
+from gsseg_core.raster.vote_total import VoteTotal
 from gsseg_core.scene.gaussian_scene import GaussianScene
 from gsseg_core.several_at_once import each_with_made, several_at_once
 from gsseg_core.text import counted
@@ -108,7 +108,7 @@ class Learner(ABC):
         self.views: dict[str, View] = {}
         self.rejected: dict[str, str] = {}
         self._unfit()
-        self._votes = np.zeros((len(scene), num_classes), np.int64)
+        self._votes = VoteTotal(len(scene), num_classes)
         self._prepared = PreparedViews(memory_budget, with_file=device == "cpu")  # what lies on a GPU is not for a file
         self._turned = False
 
@@ -186,8 +186,12 @@ class Learner(ABC):
         if shrinks:
             self._unfit()
         if num_classes != self.num_classes:
-            added = max(num_classes - self.num_classes, 0)
-            self._votes, self.num_classes = np.pad(self._votes[:, :num_classes], ((0, 0), (0, added))), num_classes
+            self._votes.resize(num_classes)
+            self.num_classes = num_classes
+
+    def most_classes(self, vote_bytes: int) -> int:
+        """How many classes there can be while votes, as they are now, take so many bytes; those there are at least."""
+        return self._votes.most_classes(vote_bytes)
 
     @property
     def codes_(self) -> np.ndarray:
@@ -233,18 +237,19 @@ class Learner(ABC):
 
     def state(self) -> State:
         """Return a copy of votes and views, to be saved."""
-        return State(self._votes.copy(), list(self.views.values()), len(self.views))
+        return State(self._votes.rows(), self.num_classes, list(self.views.values()), len(self.views))
 
     def adopt(self, state: State) -> None:
         """Replace views, votes and number of classes by a state's, of the same scene; votes of old are cast anew.
 
         What `fit` has learnt of other views is gone. Raises `StateMismatchError` where its scene has another size.
         """
-        if (found := len(state.votes)) != len(self.scene):
+        if (found := state.votes.num_rows) != len(self.scene):
             raise StateMismatchError(f"state is of {found} Gaussians; expected {len(self.scene)}, as the scene has")
+        votes = VoteTotal.from_rows(state.votes, state.num_classes)
         self._unfit()
-        self.views, self._votes = {view.name: view for view in state.views}, state.votes
-        self.num_classes = state.votes.shape[1]
+        self.views, self._votes = {view.name: view for view in state.views}, votes
+        self.num_classes = state.num_classes
         self.rejected.clear()
         self._prepared.clear()
         if state.whole_rays:
@@ -256,13 +261,7 @@ class Learner(ABC):
 
     def vote_rows(self) -> CSRRows:
         """Votes as probabilities, as `vote_codes`; rows of float32, without entries where those have zeros only."""
-        dense, possible = np.empty(self._votes.shape, np.float32), self._possible()
-        unsure = normalise_votes(self._votes, possible, dense)
-        codes = CSRRows.from_dense(dense)
-        if not unsure:
-            return codes
-        rows = np.flatnonzero(~dense.any(axis=1) & self._votes.any(axis=1))
-        return impute_probabilities(codes, self._votes, possible, rows)
+        return vote_shares(self._votes.rows(), self._possible())
 
     def vote_rows_without(self, name: str) -> CSRRows:
         """Votes of all other views as probabilities, as `vote_rows` has those of all."""
@@ -277,7 +276,7 @@ class Learner(ABC):
     def evidence(self) -> np.ndarray:
         """Weight of the labelled pixels that saw each Gaussian, over all views, in px, (N,) float32."""
         # Votes against a class are evidence as much as votes for one.
-        return np.asarray(weigh_votes(self._votes)[0] * VOTE_UNIT, np.float32)
+        return np.asarray(weigh_votes(self._votes.rows())[0] * VOTE_UNIT, np.float32)
 
     def reject_summary(self) -> dict[str, int]:
         """Count the rejected views by reason."""
@@ -393,11 +392,12 @@ class Learner(ABC):
 
     def _finish(self) -> None:
         """Clear codes without evidence, and impute those of Gaussians with votes only against classes."""
-        unsure, against = ~self.observed_, weigh_votes(self._votes)[1] < 0
+        votes = self._votes.rows()
+        unsure, against = ~self.observed_, weigh_votes(votes)[1] < 0
         # A Gaussian with votes for a class that is not `observed_` was seen in rejected regions only: it stays unknown.
         codes = self.code_rows_.only(~(unsure & ~against))
         if (unsure & against).any():
-            codes = impute_probabilities(codes, self._votes, self._possible(), np.flatnonzero(unsure & against))
+            codes = impute_probabilities(codes, votes, self._possible(), np.flatnonzero(unsure & against))
             self.observed_[unsure] = largest(codes)[0][unsure] > 0
         self.code_rows_ = codes
 

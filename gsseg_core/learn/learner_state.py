@@ -15,7 +15,7 @@ from typing import Any
 
 import numpy as np
 
-from gsseg_core.csr_rows import CSRRows
+from gsseg_core.csr_rows import CSRRows, starts
 from gsseg_core.data.class_names import check_same_names
 from gsseg_core.data.label_evidence import LabelEvidence
 from gsseg_core.data.label_images import PER_VIEW, UNKNOWN
@@ -77,7 +77,8 @@ class Learnt:
 class State:
     """What is saved of one scene."""
 
-    votes: np.ndarray  # (N, K) int64: of all views so far, in units of `VOTE_UNIT`
+    votes: CSRRows  # N rows, int64: of all views so far, in units of `VOTE_UNIT`; none of them zero
+    num_classes: int  # K, of votes and codes
     views: list[View]  # those that were kept, in the order in which they came
     num_fused: int  # views in the votes, at least as many as were kept
     class_names: dict[int, str] = field(default_factory=dict)  # as far as they are known
@@ -85,11 +86,6 @@ class State:
     living: LivingScene | None = None  # the scene, if it changes and so is in the file
     per_view: bool = False  # whether its classes are objects that its session found and numbered itself
     whole_rays: bool = False  # whether a version has cast the votes whose rays went on behind surfaces
-
-    @property
-    def num_classes(self) -> int:
-        """Classes of votes or codes."""
-        return int(self.votes.shape[1])
 
     def check_names(self, known: Mapping[int, str], source: str | os.PathLike[str], where: str) -> None:
         """Raise `StateFileError` if this state, of `source`, calls a class otherwise than it is called elsewhere."""
@@ -107,18 +103,20 @@ class State:
         """
         path = Path(path)
         check_replaceable(path, "saved state", npz_format(path) in _FORMATS)
-        seen = np.flatnonzero(self.votes.any(axis=1))
+        counts = np.diff(self.votes.indptr)
+        seen = np.flatnonzero(counts)
         header: dict[str, Any] = {
             "format": WHOLE_RAYS if self.whole_rays else FORMAT,
             "scene": digest,
-            "shape": list(self.votes.shape),
+            "shape": [self.votes.num_rows, self.num_classes],
             "views": [_entry(view) for view in self.views],
             "num_fused": self.num_fused,
             "class_names": self.class_names,
         }
         if self.per_view:
             header["ids"] = PER_VIEW
-        arrays: dict[str, Any] = {"seen": seen.astype(np.int64), "votes": self.votes[seen]}
+        of_seen = self.votes._replace(indptr=starts(counts[seen]))
+        arrays: dict[str, Any] = {"seen": seen, "votes": WithZeros(of_seen, self.num_classes)}
         if self.learnt is not None:
             header["learnt"] = {name: getattr(self.learnt, name) for name in ("learner", "num_views", "temperature")}
             arrays["codes"] = WithZeros(self.learnt.codes, self.num_classes)
@@ -173,10 +171,9 @@ class State:
         """Read a state without its scene: the scene's digest, and the state; raises `StateFileError` as `load` does."""
         with open_npz(Path(path), "a saved state", _FORMATS, None) as (file, header):
             living = living_files.read(file, header)
-            n, k = (whole_number(side, "a side of the votes", 1, LIMITS.max_gaussians) for side in header["shape"])
-            if 8 * n * k > LIMITS.max_npz_bytes or (living is not None and len(living) != n):
-                raise UnfitError(f"claims votes of {n:,} Gaussians and {k:,} classes; expected as many as its scene "
-                                 f"has, and at most {LIMITS.max_npz_bytes:,} bytes (limit max_npz_bytes)")  # fmt: skip
+            n = whole_number(header["shape"][0], "a side of the votes", 1, LIMITS.max_gaussians)
+            if living is not None and len(living) != n:
+                raise UnfitError(f"claims votes of {n:,} Gaussians; expected {len(living):,}, as its scene has")
             return str(header["scene"]), cls._read(file, header, living, n)
 
     @classmethod
@@ -205,7 +202,7 @@ class State:
             num_views = whole_number(entry["num_views"], "num_views of what was learnt", 0, _MOST_VIEWS)
             learnt = Learnt(str(entry["learner"]), codes, num_views, temperature_of(entry), _read_evidence(file, n))
         names, per_view, whole = class_names_of(header), header.get("ids") == PER_VIEW, header["format"] == WHOLE_RAYS
-        return cls(votes, views, num_fused, names, learnt, living, per_view, whole)
+        return cls(votes, k, views, num_fused, names, learnt, living, per_view, whole)
 
 
 def _entry(view: View) -> dict[str, Any]:
@@ -213,25 +210,27 @@ def _entry(view: View) -> dict[str, Any]:
     return entry if view.group is None else {**entry, "group": view.group}
 
 
-def _read_votes(file: NpzArrays, shape: tuple[int, int], num_kept: int, num_fused: int) -> np.ndarray:
-    """Read votes, (N, K) int64; of a Gaussian they cannot be more than the pixels of all views."""
+def _read_votes(file: NpzArrays, shape: tuple[int, int], num_kept: int, num_fused: int) -> CSRRows:
+    """Read votes, N rows of int64; of a Gaussian they cannot be more than the pixels of all views."""
     seen = file.expect("seen", np.int64, (None,))
     if np.any(np.diff(seen) <= 0) or np.any((seen < 0) | (seen >= shape[0])):
         raise UnfitError(f"array seen holds no Gaussians; expected ascending numbers from 0 to {shape[0] - 1}")
-    given = file.expect("votes", np.int64, (len(seen), shape[1]))
+    given = file.expect_rows("votes", np.int64, (len(seen), shape[1]))
     # Only masks that tell what is not there vote against a class; of views that were not kept, nobody knows.
     may_oppose = num_fused > num_kept or any(name.startswith("supervised_") for name in file.names)
-    if not may_oppose and given.min(initial=0) < 0:
-        raise UnfitError(f"array votes holds {given.min()}; expected none below 0")
-    most = np.abs(given, dtype=np.float64).sum(axis=1).max(initial=0)
+    if not may_oppose and given.data.min(initial=0) < 0:
+        raise UnfitError(f"array votes holds {given.data.min()}; expected none below 0")
+    counts = np.diff(given.indptr)
+    rows = np.repeat(np.arange(len(seen)), counts)
+    most = np.bincount(rows, np.abs(given.data, dtype=np.float64)).max(initial=0)
     possible = min(num_fused * _VIEW_VOTES * (shape[1] if may_oppose else 1), _MOST_VOTES)
     if most > possible:
         raise UnfitError(
             f"array votes sums to {most:.3g} in a row; expected at most {possible:.3g} of {num_fused} views"
         )
-    votes = np.zeros(shape, np.int64)
-    votes[seen] = given
-    return votes
+    of_all = np.zeros(shape[0], np.int64)
+    of_all[seen] = counts
+    return given._replace(indptr=starts(of_all))
 
 
 def _read_evidence(file: NpzArrays, num_gaussians: int) -> np.ndarray | None:

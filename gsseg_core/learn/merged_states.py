@@ -9,6 +9,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from gsseg_core.csr_rows import CSRRows
 from gsseg_core.data.class_names import names_together
 from gsseg_core.data.view import View
 from gsseg_core.errors import StateFileError, StateMismatchError
@@ -43,7 +44,7 @@ def merge_states(saved: Sequence[Saved]) -> State:  # at least one
     first = saved[0]
     names: dict[int, str] = {}
     views: dict[str, View] = {}
-    votes = np.zeros((len(first.state.votes), max(one.state.votes.shape[1] for one in saved)), np.int64)
+    votes = CSRRows.empty(first.state.votes.num_rows, np.int64)
     for number, one in enumerate(saved):
         if one.scene != first.scene or not _is_same_map(one.state.living, first.state.living):
             raise StateMismatchError(
@@ -68,16 +69,16 @@ def merge_states(saved: Sequence[Saved]) -> State:  # at least one
                     f"{one.source}: {other.source} has all its votes and views already, which would count twice; "
                     "expected each state once"
                 )
-        votes[:, : one.state.votes.shape[1]] += one.state.votes
+        votes = votes.plus(one.state.votes)
         for view in one.state.views:
             name = next(free for free in _names(view.name) if free not in views)
             views[name] = view if name == view.name else replace(view, camera=replace(view.camera, name=name))
-    num_fused = sum(one.state.num_fused for one in saved)
-    class_names = dict(sorted(names.items()))
+    num_fused, num_classes = sum(one.state.num_fused for one in saved), max(one.state.num_classes for one in saved)
     # One state alone stays of its kind.
     return replace(
-        first.state, votes=votes, views=[*views.values()], num_fused=num_fused, class_names=class_names, learnt=None
-    )
+        first.state, votes=votes.nonzero(), num_classes=num_classes, views=[*views.values()], num_fused=num_fused,
+        class_names=dict(sorted(names.items())), learnt=None,
+    )  # fmt: skip
 
 
 def _names(name: str) -> Iterator[str]:
@@ -100,10 +101,13 @@ def _is_same_map(one: LivingScene | None, other: LivingScene | None) -> bool:
 
 def _brings_nothing(one: State, other: State) -> bool:
     """Whether another state holds all views of a state, or the same votes where no views are kept."""
+    if not len(one.votes.data):
+        return False
     if not one.views:
-        return one.num_fused == other.num_fused and bool(one.votes.any()) and np.array_equal(one.votes, other.votes)
+        alike = one.num_fused == other.num_fused and one.num_classes == other.num_classes
+        return alike and all(map(np.array_equal, one.votes, other.votes))
     known = {view.name: view for view in other.views}
-    return bool(one.votes.any()) and all(_is_among(view, known) for view in one.views)
+    return all(_is_among(view, known) for view in one.views)
 
 
 def _is_among(view: View, known: dict[str, View]) -> bool:

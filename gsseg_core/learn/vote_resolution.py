@@ -8,10 +8,11 @@ from __future__ import annotations
 import numba as nb
 import numpy as np
 
-from gsseg_core.csr_rows import CSRRows
+from gsseg_core.csr_rows import CSRRows, starts
 from gsseg_core.kernels.compiler import called_by_kernels, kernel
 
 ROUNDS = 50  # of estimating how frequent classes are
+_VOTED, _UNSURE = -1, -2  # in place of the only class left, see `_count_shares`
 
 
 def resolved_votes(votes: CSRRows, possible: np.ndarray) -> CSRRows:  # int64; (K,) bool, ids that are classes
@@ -29,9 +30,23 @@ def resolved_votes(votes: CSRRows, possible: np.ndarray) -> CSRRows:  # int64; (
     return out.nonzero()
 
 
+def vote_shares(votes: CSRRows, possible: np.ndarray) -> CSRRows:  # int64; (K,) bool, ids that are classes
+    """Divide the votes for classes by their sum: probabilities, float32; rows without votes stay empty.
+
+    Where all votes are against classes, the one class without any is certain; where several of the possible have none,
+    they share as `impute_probabilities` says.
+    """
+    counts, only = _count_shares(votes, possible)
+    indptr = starts(counts)
+    shares = CSRRows(indptr, np.empty(indptr[-1], np.uint32), np.empty(indptr[-1], np.float32))
+    _share(votes, only, shares)
+    unsure = np.flatnonzero(only == _UNSURE)
+    return impute_probabilities(shares, votes, possible, unsure) if len(unsure) else shares
+
+
 def impute_probabilities(
     codes: CSRRows,  # N rows of float32
-    votes: np.ndarray,  # (N, K) int64
+    votes: CSRRows,  # N rows of int64, none of them zero
     possible: np.ndarray,  # (K,) bool: ids that are classes
     rows: np.ndarray,  # (U,) Gaussians with votes only against classes, ascending
 ) -> CSRRows:
@@ -41,9 +56,11 @@ def impute_probabilities(
     its neighbours. The background is that to which no class applies, so its frequency is known only if every class was
     looked for in some view. If one never was, only neighbours count, and without them the row stays zero: unknown.
     """
-    candidates = (votes[rows] >= 0) & possible
-    left = codes.take(rows).dense(len(possible)) * candidates
-    if not (possible & ~votes.any(axis=0))[1:].any():
+    left = codes.take(rows).dense(len(possible))
+    candidates = _candidates(votes.take(rows), possible)
+    left *= candidates
+    looked_for = np.bincount(votes.indices, minlength=len(possible)) > 0
+    if not (possible & ~looked_for)[1:].any():
         sure = np.ones(codes.num_rows, bool)
         sure[rows] = False
         known = codes.only(sure)
@@ -52,6 +69,14 @@ def impute_probabilities(
     imputed = np.full(codes.num_rows, -1)
     imputed[rows] = np.arange(len(rows))
     return codes.replaced(imputed, CSRRows.from_dense(_scaled(left)))
+
+
+def _candidates(votes: CSRRows, possible: np.ndarray) -> np.ndarray:  # U rows of int64, (K,) bool
+    """Mark the possible classes that Gaussians have no votes against, (U, K) bool."""
+    candidates, against = np.tile(possible, (votes.num_rows, 1)), votes.data < 0
+    owners = np.repeat(np.arange(votes.num_rows), np.diff(votes.indptr))
+    candidates[owners[against], votes.indices[against]] = False
+    return candidates
 
 
 def _frequency(
@@ -79,17 +104,70 @@ def _scaled(rows: np.ndarray) -> np.ndarray:  # (U, K)
 
 
 @kernel(parallel=True)
-def is_resolved(votes: np.ndarray, possible: np.ndarray) -> np.ndarray:  # (N, K) int64; (K,) bool, ids that are classes
+def weigh_votes(votes: CSRRows) -> tuple[np.ndarray, np.ndarray]:
+    """Sum of the sizes of votes, int64, for and against classes, and the least of them and 0, (N,) int64 each."""
+    indptr, _, data = votes
+    total, least = np.zeros(indptr.shape[0] - 1, np.int64), np.zeros(indptr.shape[0] - 1, np.int64)
+    for i in nb.prange(indptr.shape[0] - 1):
+        for z in range(indptr[i], indptr[i + 1]):
+            total[i] += abs(data[z])
+            least[i] = min(least[i], data[z])
+    return total, least
+
+
+def is_resolved(votes: CSRRows, possible: np.ndarray) -> np.ndarray:  # int64; (K,) bool, ids that are classes
     """Tell which Gaussians have a vote for a class, or only one class left, (N,) bool."""
-    out = np.empty(votes.shape[0], np.bool_)
-    for i in nb.prange(votes.shape[0]):
-        named, against, free = False, False, 0
-        for k in range(votes.shape[1]):
-            named |= votes[i, k] > 0
-            against |= votes[i, k] < 0
-            free += votes[i, k] == 0 and possible[k]
-        out[i] = named or (against and free == 1)
-    return out
+    counts, _ = _count_shares(votes, possible)
+    return np.asarray(counts > 0)
+
+
+@kernel(parallel=True)
+def _count_shares(votes: CSRRows, possible: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Count the classes of each Gaussian that have a share in its probabilities, (N,) int64.
+
+    Second comes, (N,) int32: the only class left where all votes are against classes; `_UNSURE` where there are more of
+    those, or none; else `_VOTED`.
+    """
+    indptr, classes, data = votes
+    counts, only = np.zeros(indptr.shape[0] - 1, np.int64), np.empty(indptr.shape[0] - 1, np.int32)
+    for i in nb.prange(indptr.shape[0] - 1):
+        only[i] = _VOTED
+        for z in range(indptr[i], indptr[i + 1]):
+            counts[i] += data[z] > 0
+        if counts[i] == 0 and indptr[i] < indptr[i + 1]:
+            only[i] = _only_possible(classes[indptr[i] : indptr[i + 1]], possible)
+            counts[i] = only[i] >= 0
+    return counts, only
+
+
+@called_by_kernels
+def _only_possible(classes: np.ndarray, possible: np.ndarray) -> int:
+    """Return the one possible class that is not among these, ascending; `_UNSURE` if there are more, or none."""
+    found, z = _UNSURE, 0
+    for k in range(possible.shape[0]):
+        if z < classes.shape[0] and classes[z] == k:
+            z += 1
+        elif possible[k]:
+            if found >= 0:
+                return _UNSURE
+            found = k
+    return found
+
+
+@kernel(parallel=True)
+def _share(votes: CSRRows, only: np.ndarray, shares: CSRRows) -> None:
+    indptr, classes, data = votes
+    share_indptr, share_classes, share_data = shares
+    for i in nb.prange(indptr.shape[0] - 1):
+        total, place = np.int64(0), share_indptr[i]
+        if only[i] >= 0:
+            share_classes[place], share_data[place] = only[i], 1.0
+        for z in range(indptr[i], indptr[i + 1]):
+            total += max(data[z], 0)
+        for z in range(indptr[i], indptr[i + 1]):
+            if data[z] > 0:
+                share_classes[place], share_data[place] = classes[z], data[z] / total
+                place += 1
 
 
 @called_by_kernels

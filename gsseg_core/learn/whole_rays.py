@@ -6,12 +6,14 @@ from collections.abc import Callable
 
 import numpy as np
 
+from gsseg_core.csr_rows import CSRRows, starts
 from gsseg_core.data.label_evidence import LabelEvidence
 from gsseg_core.data.soft_masks import SeenLabels
 from gsseg_core.data.view import View
 from gsseg_core.learn.learner_state import State
 from gsseg_core.raster.constants import CHANNELS
 from gsseg_core.raster.view_operator import ViewOperator
+from gsseg_core.raster.vote_total import VoteTotal
 
 _ROUNDING = 1e-3  # what is taken from a vote differs from what was added by at most this share: rounding makes 1e-5
 
@@ -19,26 +21,28 @@ _ROUNDING = 1e-3  # what is taken from a vote differs from what was added by at 
 def votes_cast_anew(
     state: State, operator_of: Callable[[View], ViewOperator], used: Callable[[SeenLabels, ViewOperator], SeenLabels],
     units: float,
-) -> np.ndarray:  # fmt: skip
-    """Return the votes of a state, (N, K) int64; those of the views that it keeps by rays that end at surfaces.
+) -> VoteTotal:  # fmt: skip
+    """Return the votes of a state; those of the views that it keeps by rays that end at surfaces.
 
     Votes of views that are not kept stay as they are. Those that the kept views had cast are computed again and taken
     from the sum. Rounding differs from when they were added, so what is left of a sum is 0 where it may be rounding.
     """
-    all_kept = state.num_fused == len(state.views)
-    left = np.zeros_like(state.votes) if all_kept else state.votes.copy()
-    anew, taken = np.zeros_like(state.votes), np.zeros(state.votes.shape, np.float32)
+    shape, all_kept = (state.votes.num_rows, state.num_classes), state.num_fused == len(state.views)
+    left = VoteTotal(*shape) if all_kept else VoteTotal.from_rows(state.votes, state.num_classes)
+    anew, taken = VoteTotal(*shape), VoteTotal(*shape)
     for view in state.views:
         operator = operator_of(view)
         seen = used(view.read_seen(), operator)
         operator.vote(*seen, anew, units)
         if not all_kept:
             _take(left, taken, operator, seen, units)
-    left[np.abs(left) <= _ROUNDING * taken] = 0
-    return left + anew
+    cast = taken.rows()
+    rest, rounded = left.rows().united(cast.with_data(_ROUNDING * cast.data.astype(np.float32)))
+    anew.add_rows(rest.with_data(np.where(np.abs(rest.data) <= rounded.data, 0, rest.data)).nonzero())
+    return anew
 
 
-def _take(left: np.ndarray, taken: np.ndarray, operator: ViewOperator, seen: SeenLabels, units: float) -> None:
+def _take(left: VoteTotal, taken: VoteTotal, operator: ViewOperator, seen: SeenLabels, units: float) -> None:
     """Take the votes of a view by whole rays from a sum; `taken` counts how many were, for or against."""
     present = np.unique(seen.labels[seen.labels >= 0])  # Where the mask has evidence of its own, 0 to L - 1.
     rows = (seen.evidence or LabelEvidence(present)).votes
@@ -48,6 +52,12 @@ def _take(left: np.ndarray, taken: np.ndarray, operator: ViewOperator, seen: See
         for c in range(len(some)):
             of_label = slice(*rows.indptr[first + c : first + c + 2])
             for k, vote in zip(rows.indices[of_label], rows.data[of_label], strict=True):
-                cast = np.rint(weights[:, c] * vote * units)
-                left[:, k] -= cast.astype(np.int64)
-                taken[:, k] += np.abs(cast)
+                cast = _column(np.rint(weights[:, c] * vote * units).astype(np.int64), k)
+                left.add_rows(cast.with_data(-cast.data))
+                taken.add_rows(cast.with_data(np.abs(cast.data)))
+
+
+def _column(votes: np.ndarray, k: int) -> CSRRows:  # (N,)
+    """Give votes for one class as rows."""
+    cast = votes != 0
+    return CSRRows(starts(cast), np.full(np.count_nonzero(cast), k, np.uint32), votes[cast])

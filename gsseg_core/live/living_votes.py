@@ -16,6 +16,7 @@ from gsseg_core.live.scene_change import SceneChange
 from gsseg_core.raster.backends import make_operator
 from gsseg_core.raster.cpu.occlusion import ray_ends
 from gsseg_core.raster.view_operator import ViewOperator
+from gsseg_core.raster.vote_total import VoteTotal
 from gsseg_core.scene.group_frames import IDENTITY, is_identity
 from gsseg_core.scene.living_scene import LivingScene
 
@@ -82,10 +83,11 @@ class LivingVotes(VoteLearner):
         from_nothing = all_kept and 2 * len(lifted) > len(views)
         names = list(views) if from_nothing else lifted
         if from_nothing:
-            self._votes[:] = 0
+            self._votes = VoteTotal(len(change.after), self.num_classes)
         else:
             self._lift_all(self.views, lifted, -1)
-        self._votes, self.living, self.scene = change.carry(self._votes), change.after, change.after.scene
+            self._votes = VoteTotal.from_rows(change.carry(self._votes.rows()), self.num_classes)
+        self.living, self.scene = change.after, change.after.scene
         self._lift_all(views, names, 1)
         self.views = views
         for name in lifted:
@@ -137,7 +139,7 @@ class LivingVotes(VoteLearner):
 
 def carried_over(state: State, change: SceneChange, joining: Mapping[str, int | None], device: str) -> State:
     """Take what was saved of the scene before a change over to that after it; `joining` as for `LivingVotes.change`."""
-    votes = LivingVotes(change.before, state.votes.shape[1], device=device)
+    votes = LivingVotes(change.before, state.num_classes, device=device)
     votes.adopt(state)
     votes.change(change, joining)
     now, learnt = votes.state(), state.learnt and state.learnt.carried(change.carry)

@@ -20,6 +20,7 @@ from gsseg_core.learn.vote_learner import VoteLearner
 from gsseg_core.live.results import Outcome, Rejection
 from gsseg_core.live.session import LiveSession
 from gsseg_core.objects.object_table import ObjectTable, Repair, object_name
+from gsseg_core.raster.vote_total import VoteTotal
 from gsseg_core.scene.camera import Camera
 from gsseg_core.segmentation import Segmentation
 
@@ -96,8 +97,7 @@ class PerViewSession(LiveSession):
             for name in names:
                 self._live.retract(name)
             if moved and forgotten:
-                state = self._live.state()
-                self._live.adopt(State(_renumber(state.votes, repair.successors), state.views, state.num_fused))
+                self._live.adopt(_with_numbers(self._live.state(), repair.successors))
             for view in views.values():
                 self._live.observe(view)
             # The oldest view still is the first one to go.
@@ -147,13 +147,15 @@ class PerViewSession(LiveSession):
         """Replace all that is known by a saved state, as `LiveSession.load` does; its labels are numbers of objects."""
         with self._lock:
             loaded = super().load(path, within)
-            votes = self._live.state().votes
+            known = self._live.state()
+            votes = VoteTotal.from_rows(known.votes, known.num_classes)
             for view in self._live.views.values():
                 if observation := self._table.adopt(view):
                     observation.vote(votes, UNITS, -1)
             self._table.reserve(self._live.num_classes - 1)
             if self.num_fused > self.num_views:  # The votes left are of dropped views: what these showed is not new.
-                self._table.recall(votes * VOTE_UNIT)
+                rest = votes.rows()
+                self._table.recall(rest.with_data(rest.data * VOTE_UNIT))
         return loaded
 
     def _forget(self, class_names: Mapping[int, str], votes: VoteLearner) -> None:
@@ -172,15 +174,15 @@ class PerViewSession(LiveSession):
             self._table.forget(name)
 
 
+def _with_numbers(state: State, successors: np.ndarray) -> State:  # (K',)
+    """Add up votes for classes that get the same number."""
+    numbers = np.arange(state.num_classes)
+    numbers[: len(successors)] = successors[: len(numbers)]
+    votes = state.votes.in_columns(numbers[state.votes.indices]).nonzero()
+    return replace(state, votes=votes, num_classes=max(state.num_classes, int(successors.max()) + 1))
+
+
 def _renumbered(learnt: Learnt, successors: np.ndarray) -> Learnt:
     codes, table = learnt.codes, np.arange(int(learnt.codes.indices.max(initial=0)) + 1)
     table[: len(successors)] = successors[: len(table)]
     return replace(learnt, codes=codes.in_columns(table[codes.indices]))
-
-
-def _renumber(columns: np.ndarray, successors: np.ndarray) -> np.ndarray:
-    """Add up columns (N, K) that get the same number by `successors` (K',)."""
-    out = np.zeros((len(columns), max(columns.shape[1], int(successors.max()) + 1)), columns.dtype)
-    for k in range(columns.shape[1]):
-        out[:, successors[k] if k < len(successors) else k] += columns[:, k]
-    return out

@@ -221,7 +221,7 @@ class LiveSession:
         if dataset is not None:
             views = dataset.views("train")
             self._classes.check_dataset(dataset, fused=self.num_fused > 0)
-            num_classes = self._classes.count_with(dataset, num_classes, len(scene))
+            num_classes = self._classes.count_with(dataset, num_classes, self._live)
         made = make_learner(learner, scene, num_classes, max_steps=max_steps, device=self.device)
         views = spread(views, num_views)
         outcome = fitted(learner, made, views, report, watch or Stopwatch())
@@ -327,7 +327,7 @@ class LiveSession:
         """
         state = self._read_state(Path(path), within)
         self._check_classes(path, state)
-        votes = self._no_votes(state.votes.shape[1])
+        votes = self._no_votes(state.num_classes)
         votes.adopt(state)  # To cast votes of old anew takes long.
         votes.resize(max(state.num_classes, self._classes.least))  # Out of memory here, nothing is forgotten.
         with self._lock:
@@ -376,7 +376,7 @@ class LiveSession:
         """Raise `StateFileError` if a state has too many classes, other names than were declared, or objects."""
         if state.per_view and not self._PER_VIEW:
             raise StateFileError(f"{path}: {OBJECTS_OF_ONE_SESSION}; expected classes, or a session with ids per-view")
-        self._classes.check_state(state, path, len(self.scene))
+        self._classes.check_state(state, path, self._live)
 
     def _posed_views(self) -> list[View]:
         """List the views that are kept, posed in the scene as it is now."""
@@ -390,7 +390,7 @@ class LiveSession:
         """Add classes up to the largest label of a view, unless they were declared."""
         if not self._classes.declared and view.has_mask and view.largest_label >= self._live.num_classes:
             found = f"view '{view.name}': {self._LABEL} {view.largest_label}"
-            self._classes.check_label(view.largest_label, len(self.scene), found, self._REMEDY)
+            self._classes.check_label(view.largest_label, self._live, found, self._REMEDY)
             self._live.resize(view.largest_label + 1)
 
     def _drop_old_views(self) -> None:

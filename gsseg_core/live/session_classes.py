@@ -9,10 +9,14 @@ from gsseg_core.data.class_names import BACKGROUND_NAME, check_class_names, chec
 from gsseg_core.data.dataset import Dataset
 from gsseg_core.errors import ClassesFileError, SettingsError, StateFileError, UnknownLabelError
 from gsseg_core.files.limits import MAX_LABEL
+from gsseg_core.learn.learner import Learner
 from gsseg_core.learn.learner_state import State
 
 VOTES_LIMIT = 2 << 30
-"""Bytes of votes up to which classes without declared names are added as their labels turn up."""
+"""Bytes of votes up to which classes without declared names are added as their labels turn up.
+
+Those that are there already may go beyond: what they take depends on where their masks lie.
+"""
 
 
 class SessionClasses:
@@ -28,17 +32,17 @@ class SessionClasses:
         """How many there are before any view has come: those declared, or the background alone."""
         return max(self.names) + 1 if self.declared else 1
 
-    def limit(self, num_gaussians: int) -> tuple[int, str]:
-        """How many there may be: those declared, or what is allowed and there is memory for.
+    def limit(self, votes: Learner) -> tuple[int, str]:
+        """How many there may be: those declared, or what is allowed and there is memory for beside the votes so far.
 
         Second comes the reason, as the end of a sentence that the number is in.
         """
         if self.declared:
             return self.least, " (as named)"
-        affordable = VOTES_LIMIT // (8 * num_gaussians)
+        affordable = votes.most_classes(VOTES_LIMIT)
         if self._max_classes <= affordable:
             return self._max_classes, f", as max_classes is {self._max_classes}"
-        return affordable, f" for a scene of {num_gaussians} Gaussians"
+        return affordable, f" for a scene of {len(votes.scene)} Gaussians"
 
     def reset(self, names: Mapping[int, str]) -> None:
         """Replace the names, unless they were declared."""
@@ -53,17 +57,17 @@ class SessionClasses:
         self.names = {**self.names, **added}
         return ids, bool(added)
 
-    def check_state(self, state: State, path: str | os.PathLike[str], num_gaussians: int) -> None:
+    def check_state(self, state: State, path: str | os.PathLike[str], votes: Learner) -> None:
         """Raise `StateFileError` if a state has too many classes, or other names than were declared."""
-        most, why = self.limit(num_gaussians)
+        most, why = self.limit(votes)
         if state.num_classes > most:
             raise StateFileError(f"{path}: holds {state.num_classes} classes; expected at most {most}{why}")
         if self.declared:
             state.check_names(self.names, path, "the names that were given")
 
-    def check_label(self, label: int, num_gaussians: int, found: str, remedy: str) -> None:
+    def check_label(self, label: int, votes: Learner, found: str, remedy: str) -> None:
         """Raise `UnknownLabelError` where there may be no such class: what was `found`, what is expected, a remedy."""
-        most, why = self.limit(num_gaussians)
+        most, why = self.limit(votes)
         if label >= most:
             raise UnknownLabelError(f"{found}; expected at most {most - 1}{why}{remedy}")
 
@@ -77,11 +81,11 @@ class SessionClasses:
         called, known = {k: name for k, name in given.items() if k}, self.names if self.declared or fused else {}
         check_same_names(called, known, dataset.root, "the session that is to learn from it", ClassesFileError)
 
-    def count_with(self, dataset: Dataset, num_classes: int, num_gaussians: int) -> int:
+    def count_with(self, dataset: Dataset, num_classes: int, votes: Learner) -> int:
         """Count the classes with those of a dataset; raises `UnknownLabelError` if they are too many."""
         if self.declared:
             return num_classes
-        (most, why), count = self.limit(num_gaussians), max(num_classes, dataset.num_classes)
+        (most, why), count = self.limit(votes), max(num_classes, dataset.num_classes)
         if count > most:
             raise UnknownLabelError(
                 f"{dataset.root}: has {count} classes; expected at most {most}{why}, or class_names that declare them"

@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy import sparse
 
-from gsseg_core.csr_rows import starts
+from gsseg_core.csr_rows import CSRRows, starts
 from gsseg_core.metrics import iou
 from gsseg_core.objects.association_kernels import add_common, take_away
 from gsseg_core.objects.depth_edges import Borders, borders, depth_edges
@@ -67,13 +67,15 @@ class Profiles:
         return cls(sparse.csr_matrix((num_gaussians, 1)))
 
     @classmethod
-    def of(cls, votes: np.ndarray, kept: float) -> Profiles:
-        """Make those of votes for objects, (N, K) in px; of each, only the heaviest Gaussians, as `Lifted.of` does."""
-        objects, ids = np.nonzero(votes.T > 0)
-        weights = votes[ids, objects]
+    def of(cls, votes: CSRRows, kept: float) -> Profiles:
+        """Make those of votes for objects, in px; of each, only the heaviest Gaussians, as `Lifted.of` does."""
+        counts, voted = np.diff(votes.indptr), votes.data > 0
+        ids = np.repeat(np.arange(len(counts)), counts)[voted]
+        objects, weights = votes.indices[voted].astype(np.int64), votes.data[voted]
         order = np.lexsort([ids, -weights, objects])
-        heavy = order[_heaviest(objects[order], weights[order], np.bincount(objects, weights, votes.shape[1]), kept)]
-        return cls(sparse.csr_matrix((weights[heavy], (ids[heavy], objects[heavy])), shape=votes.shape))
+        shape = len(counts), int(objects.max(initial=0)) + 1
+        heavy = order[_heaviest(objects[order], weights[order], np.bincount(objects, weights, shape[1]), kept)]
+        return cls(sparse.csr_matrix((weights[heavy], (ids[heavy], objects[heavy])), shape=shape))
 
     def add(self, segments: Lifted, objects: np.ndarray) -> None:  # (L,)
         """Add the segments of a view to their objects."""

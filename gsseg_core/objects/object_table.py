@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from gsseg_core.csr_rows import largest
+from gsseg_core.csr_rows import CSRRows, largest
 from gsseg_core.data.class_names import BACKGROUND_NAME
 from gsseg_core.data.label_images import UNKNOWN
 from gsseg_core.data.view import View
@@ -152,13 +152,14 @@ class ObjectTable:
         """Give no new object a number up to this one."""
         self._largest = max(self._largest, number)
 
-    def recall(self, votes: np.ndarray) -> None:
-        """Have the votes of views that are gone, (N, K) in px, count for `match`, as those of views that it forgot.
+    def recall(self, votes: CSRRows) -> None:
+        """Have the votes of views that are gone, N rows in px, count for `match`, as those of views that it forgot.
 
-        Raises `SceneValueError` for votes of another shape, or that are not finite.
+        Raises `SceneValueError` for votes of another number of Gaussians, or that are not finite.
         """
-        if votes.ndim != 2 or len(votes) != len(self.scene) or not np.isfinite(votes).all():
-            found = f"votes have shape {votes.shape}, {votes.min(initial=0)} to {votes.max(initial=0)}"
+        if votes.num_rows != len(self.scene) or not np.isfinite(votes.data).all():
+            shape = votes.num_rows, int(votes.indices.max(initial=0)) + 1
+            found = f"votes have shape {shape}, {votes.data.min(initial=0)} to {votes.data.max(initial=0)}"
             raise SceneValueError(f"objects: {found}; expected ({len(self.scene)}, K), finite")
         self._forgotten = Profiles.of(votes, self.settings.kept)
         self._fill()

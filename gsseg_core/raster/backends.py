@@ -11,9 +11,8 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 from gsseg_core.errors import SettingsError
 
 if TYPE_CHECKING:
-    import numpy as np
-
     from gsseg_core.raster.view_operator import ViewOperator
+    from gsseg_core.raster.vote_total import VoteTotal
     from gsseg_core.scene.camera import Camera
     from gsseg_core.scene.gaussian_scene import GaussianScene
 
@@ -76,10 +75,10 @@ def free_memory_on(device: str) -> int | None:
     return _module_of(device).free_memory_on(device)
 
 
-def vote_total(votes: np.ndarray, device: str) -> AbstractContextManager[Any]:
+def vote_total(votes: VoteTotal, device: str) -> AbstractContextManager[Any]:
     """Give a total on a device, to which `Observation.vote` adds views one after the other.
 
-    When the context is left, it has been added to `votes`, (N, K) int64.
+    When the context is left, it has been added to `votes`.
     """
     return _module_of(device).vote_total(votes, device)
 

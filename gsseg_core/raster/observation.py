@@ -6,16 +6,16 @@ from abc import ABC, abstractmethod
 from functools import cached_property
 from typing import Any, NamedTuple
 
-import numba as nb
 import numpy as np
 
-from gsseg_core.csr_rows import CSRRows, starts
-from gsseg_core.data.label_evidence import LabelEvidence, vote_units
+from gsseg_core.csr_rows import starts
+from gsseg_core.data.label_evidence import LabelEvidence
 from gsseg_core.errors import SceneValueError
-from gsseg_core.kernels.compiler import kernel
 from gsseg_core.raster.view_renderer import ViewRenderer
+from gsseg_core.raster.vote_total import PairVotes, VoteTotal
 from gsseg_core.scene.camera import Camera
-from gsseg_core.simd import AHEAD, prefetch
+
+_PARTS = 64  # of the pairs of a view, whose votes are added beside each other
 
 
 class VoteShares(NamedTuple):
@@ -118,12 +118,14 @@ class Observation(ABC):
     def vote(self, total: Any, units: float, sign: int = 1) -> None:
         """Add the votes to a total of all views, or take them away (sign -1), exactly: in whole units.
 
-        The total is an (N, K) int64 array, or what `gsseg_core.raster.backends.vote_total` has in place of it. Raises
-        `SceneValueError` where an array has too few rows or classes, or another type.
+        The total is a `VoteTotal`, or what `gsseg_core.raster.backends.vote_total` has in place of it. Raises
+        `SceneValueError` where it has too few Gaussians or classes, or is something else.
         """
         rows, classes = self.ids.max(initial=-1) + 1, self.evidence.votes.indices.max(initial=0) + 1
         check_total(self.name, total, rows, classes)
-        add_votes(total, self.ids, self.start, self.labels, self.evidence.votes, self.votes(), units, sign)
+        borders = self.start[np.arange(_PARTS + 1) * len(self.ids) // _PARTS]
+        gaussians, parts = np.repeat(self.ids, np.diff(self.start)), np.stack([borders[:-1], borders[1:]], axis=1)
+        total.add(PairVotes(gaussians, self.labels, self.votes(), parts), self.evidence.votes, units, sign)
 
     def shares(self, likelihood: np.ndarray, rest: np.ndarray) -> VoteShares:
         """Share one vote per labelled pixel, times its weight, among the Gaussians that made it.
@@ -148,29 +150,9 @@ class Observation(ABC):
     def _shares(self, likelihood: np.ndarray, rest: np.ndarray) -> VoteShares: ...
 
 
-def check_total(view: str, total: np.ndarray, rows: int, classes: int) -> None:
+def check_total(view: str, total: VoteTotal, rows: int, classes: int) -> None:
     """Refuse a total to which a view cannot add its votes: kernels would write beyond it."""
-    if total.ndim != 2 or len(total) < rows or total.shape[1] < classes or total.dtype != np.int64:
-        found = f"votes have shape {total.shape}, {total.dtype}"
-        raise SceneValueError(f"view '{view}': {found}; expected ({rows}, {classes}) or more, int64")
-
-
-@kernel(parallel=True)
-def add_votes(
-    total: np.ndarray, ids: np.ndarray,  # (N, K) int64, added to; (M,) int32, ascending
-    start: np.ndarray, labels: np.ndarray,  # (M + 1,); (P,) int32: label of each pair
-    label_votes: CSRRows, votes: np.ndarray,  # L rows, float64: what a pixel of each label votes; (P,) float32
-    units: float, sign: int,  # per vote; a power of 2
-) -> None:  # fmt: skip
-    """Add a view's votes to those of other views, or take them away."""
-    cells = total.reshape(-1)
-    for m in nb.prange(ids.shape[0]):
-        # A row may be several cache lines: what is asked for is the one with the first label's class.
-        later = min(m + AHEAD, ids.shape[0] - 1)
-        first = label_votes.indptr[labels[min(start[later], labels.shape[0] - 1)]]
-        column = label_votes.indices[first] if first < len(label_votes.indices) else 0
-        prefetch(cells, np.int64(ids[later]) * total.shape[1] + np.int64(column))
-        row = total[ids[m]]
-        for s in range(start[m], start[m + 1]):
-            for j in range(label_votes.indptr[labels[s]], label_votes.indptr[labels[s] + 1]):
-                row[label_votes.indices[j]] += sign * vote_units(votes[s], label_votes.data[j], units)
+    if not isinstance(total, VoteTotal):
+        raise SceneValueError(f"view '{view}': votes are {type(total).__name__}; expected a VoteTotal")
+    if total.shape[0] < rows or total.shape[1] < classes:
+        raise SceneValueError(f"view '{view}': votes have shape {total.shape}; expected ({rows}, {classes}) or more")

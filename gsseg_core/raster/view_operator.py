@@ -14,6 +14,7 @@ from gsseg_core.raster.constants import BLOCK
 from gsseg_core.raster.objects_alone import ObjectsAlone
 from gsseg_core.raster.observation import LabelWeights, Observation, check_total
 from gsseg_core.raster.view_renderer import ViewRenderer
+from gsseg_core.raster.vote_total import VoteTotal
 from gsseg_core.scene.gaussian_scene import GaussianScene
 
 
@@ -104,7 +105,7 @@ class ViewOperator(ViewRenderer):
         return self._lift(labels)
 
     def vote(
-        self, labels: np.ndarray, evidence: LabelEvidence | None, total: np.ndarray, units: float, sign: int = 1
+        self, labels: np.ndarray, evidence: LabelEvidence | None, total: VoteTotal, units: float, sign: int = 1
     ) -> bool:
         """Add the votes of a mask to those of other views, as `Observation.vote` does, and keep nothing of the view.
 
@@ -112,8 +113,8 @@ class ViewOperator(ViewRenderer):
         ----------
         labels, evidence
             The mask, as for `observe`, which also says what is raised.
-        total : (N, K) int64
-            Votes in units, of K classes, among them all that the mask speaks of; added to.
+        total : VoteTotal
+            Votes of N Gaussians for K classes, among them all that the mask speaks of; added to.
         units : float
             Units per px of weight; a power of 2.
         sign : int
@@ -127,11 +128,12 @@ class ViewOperator(ViewRenderer):
         Raises
         ------
         SceneValueError
-            The total has another number of rows, too few classes, or another type.
+            The total is of another number of Gaussians, has too few classes, or is something else.
         """
         self._check_labels(labels, evidence)
-        self._check_rows(len(total), None, what="votes")
         most = int((labels if evidence is None else evidence.votes.indices).max(initial=0))
+        if isinstance(total, VoteTotal):
+            self._check_rows(total.shape[0], None, what="votes")
         check_total(self.camera.name, total, self.num_gaussians, most + 1)
         return self._vote(labels, evidence, total, units, sign)
 
@@ -215,7 +217,7 @@ class ViewOperator(ViewRenderer):
         return self._observe(labels, None).by_label()
 
     def _vote(
-        self, labels: np.ndarray, evidence: LabelEvidence | None, total: np.ndarray, units: float, sign: int
+        self, labels: np.ndarray, evidence: LabelEvidence | None, total: VoteTotal, units: float, sign: int
     ) -> bool:
         observation = self.observe(labels, evidence)
         observation.vote(total, units, sign)

@@ -188,9 +188,9 @@ def test_votes_against_classes_are_kept_where_masks_say_what_is_not_there(tmp_pa
     partial = View.from_arrays(view.camera, view.read_labels() * (view.read_labels() == 1), supervised=[1])
     learner = taught(VoteLearner(SCENE, NUM_CLASSES), [partial])
     learner.state().save(tmp_path / "state.npz", SCENE.digest)
-    votes = State.load(tmp_path / "state.npz", SCENE.digest, N).votes
+    votes = State.load(tmp_path / "state.npz", SCENE.digest, N).votes.dense(NUM_CLASSES)
     assert votes.min() < 0
-    np.testing.assert_array_equal(votes, learner._votes)
+    np.testing.assert_array_equal(votes, learner._votes.dense())
 
 
 @pytest.mark.parametrize("name", ["labels", "probabilities", "clustered", "learnt"])

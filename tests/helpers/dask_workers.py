@@ -81,7 +81,7 @@ def client_of_victims_fixture() -> Iterator[Any]:
 def assert_same(one: Learner, other: Learner) -> None:
     for learner in (one, other):
         learner.fit()
-    np.testing.assert_array_equal(one._votes, other._votes)
+    np.testing.assert_array_equal(one._votes.dense(), other._votes.dense())
     np.testing.assert_array_equal(one.codes_, other.codes_)
     np.testing.assert_array_equal(one.observed_, other.observed_)
     assert one.history_ == other.history_ and one.converged_ == other.converged_

@@ -220,10 +220,10 @@ def test_a_view_is_taken_back_as_exactly_as_it_was_added() -> None:
     learner = EMLearner(SCENE, NUM_CLASSES, EMSettings())
     views = clean_views(3)
     learner.observe_all(views[:2])
-    before = learner._votes.copy()
+    before = learner._votes.dense()
     learner.observe(views[2])
     learner.retract(views[2].name)
-    np.testing.assert_array_equal(learner._votes, before)
+    np.testing.assert_array_equal(learner._votes.dense(), before)
 
 
 def test_a_negative_width_is_refused() -> None:

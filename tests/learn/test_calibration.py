@@ -134,10 +134,10 @@ def fitted(kind: type[Learner]) -> Learner:
 
 def test_votes_without_a_view_are_those_of_a_learner_that_never_saw_it() -> None:
     learner = fitted(VoteLearner)
-    before = learner._votes.copy()
+    before = learner._votes.dense()
     others = taught(VoteLearner(SCENE, NUM_CLASSES), VIEWS[1:]).fit()
     np.testing.assert_array_equal(learner.vote_rows_without(VIEWS[0].name).dense(NUM_CLASSES), others.codes_)
-    np.testing.assert_array_equal(learner._votes, before)
+    np.testing.assert_array_equal(learner._votes.dense(), before)
 
 
 def test_where_no_labelled_pixel_is_sampled_all_is_unknown_and_probabilities_stay_as_they_are() -> None:

@@ -96,7 +96,7 @@ def test_a_broken_mask_is_one_clear_error_and_changes_nothing(
     there = DistributedVotes(client, GaussianScene.load(data / "scene.ply"), NUM_CLASSES)
     with pytest.raises(MaskFormatError, match=r"view1\.png"):
         there.observe_all(Dataset(data).views("train"))
-    assert not there.views and not there._votes.any()
+    assert not there.views and not there._votes.dense().any()
 
 
 @pytest.mark.parametrize(("version", "says"), [(None, "no gsseg"), ("0.0.1", "gsseg 0.0.1")])

@@ -216,7 +216,7 @@ def test_steps_agree_with_a_slow_twin_written_from_the_equations(changes: dict[s
     assert (learner.rejected_share(views[1]) > 0) == rejects
     codes, objectives, confusions = slow_em(SCENE, views, settings, rounds)
     # Where a Gaussian shows in a trace of a pixel only, its votes are rounded to whole units.
-    firm = learner._votes.sum(axis=1) > 2**14
+    firm = learner._votes.dense().sum(axis=1) > 2**14
     np.testing.assert_allclose(learner.codes_[firm], codes[firm], atol=2e-3)
     np.testing.assert_allclose(learner.history_, objectives, rtol=1e-4)
     for name, confusion in confusions.items():
@@ -243,7 +243,7 @@ def test_it_stops_by_itself(views: list[View]) -> None:
 
 def test_no_step_gains_more_than_its_slope_promises() -> None:
     learner = taught(EMLearner(SCENE, NUM_CLASSES), wrong_views(4))
-    votes = CSRRows.from_dense(learner._votes)
+    votes = learner._votes.rows()
     models = learner._initial_error_models(votes, {}, lambda: None)
     codes, prior = votes.with_data(votes.data.astype(np.float32)).normalised(), np.full(len(votes.data), 0.1)
 
@@ -310,7 +310,7 @@ def test_the_order_of_the_gaussians_does_not_matter() -> None:
 def test_sums_over_views_do_not_depend_on_order_or_grouping(groups: list[int], order: list[int]) -> None:
     learner = taught(EMLearner(SCENE, NUM_CLASSES), [with_clutter(view) for view in wrong_views(6)])
     codes, names = CSRRows.from_dense(learner.vote_codes() + np.float32(0.01)), list(learner.views)
-    votes = CSRRows.from_dense(learner._votes)
+    votes = learner._votes.rows()
     models = learner._initial_error_models(votes, learner._reject_regions(votes, lambda: None)[1], lambda: None)
     whole, counted = learner._e_step(codes, deepcopy(models), lambda: None)
     parts = np.zeros_like(whole)
@@ -326,7 +326,7 @@ def test_codes_without_a_view_are_a_step_with_the_gains_of_all_the_others() -> N
     learner = taught(EMLearner(SCENE, NUM_CLASSES), [with_clutter(view) for view in wrong_views(4)])
     codes = CSRRows.from_dense(learner.vote_codes() + np.float32(0.01))
     prior = np.random.default_rng(0).uniform(0, 3, len(codes.data)).astype(np.float32)
-    votes = CSRRows.from_dense(learner._votes)
+    votes = learner._votes.rows()
     models = learner._initial_error_models(votes, learner._reject_regions(votes, lambda: None)[1], lambda: None)
     gradient, _ = learner._e_step(codes, models, lambda: None)
     for name in learner.views:

@@ -62,35 +62,35 @@ def test_what_no_view_sees_is_unobserved_until_its_neighbours_fill_it_in(kind: t
 
 def test_votes_of_classes_that_are_no_more_are_gone_and_the_others_stay() -> None:
     learner = taught(VoteLearner(SCENE, NUM_CLASSES), VIEWS)
-    before = learner._votes
+    before = learner._votes.dense()
     learner.resize(NUM_CLASSES + 2)
-    assert learner._votes.shape == (len(SCENE), NUM_CLASSES + 2) and not learner._votes[:, NUM_CLASSES:].any()
+    assert learner._votes.shape == (len(SCENE), NUM_CLASSES + 2) and not learner._votes.dense()[:, NUM_CLASSES:].any()
     learner.resize(NUM_CLASSES)
-    np.testing.assert_array_equal(learner._votes, before)
-    assert learner._votes.flags.c_contiguous and learner.num_classes == NUM_CLASSES
+    np.testing.assert_array_equal(learner._votes.dense(), before)
+    assert learner.num_classes == NUM_CLASSES
 
 
 @pytest.mark.parametrize("memory_budget", [None, 0])
 def test_no_class_goes_that_a_view_shows_and_its_votes_can_be_taken_back(memory_budget: int | None) -> None:
     learner = taught(VoteLearner(SCENE, NUM_CLASSES, memory_budget=memory_budget), VIEWS)
-    before = learner._votes.copy()
+    before = learner._votes.dense()
     message = f"num_classes is {NUM_CLASSES - 1}; expected more than {NUM_CLASSES - 1}, which a view shows"
     with pytest.raises(SettingsError, match=message):
         learner.resize(NUM_CLASSES - 1)
     assert learner.num_classes == NUM_CLASSES
-    np.testing.assert_array_equal(learner._votes, before)
+    np.testing.assert_array_equal(learner._votes.dense(), before)
     for view in VIEWS:
         learner.retract(view.name)
-    assert not learner._votes.any()
+    assert not learner._votes.dense().any()
     learner.resize(1)
 
 
 def test_a_view_that_cannot_be_moved_keeps_its_votes_and_its_camera() -> None:
     learner = taught(VoteLearner(SCENE, NUM_CLASSES), VIEWS)
-    before, view = learner._votes.copy(), VIEWS[0]
+    before, view = learner._votes.dense(), VIEWS[0]
     with pytest.raises(MaskSizeError):
         learner.move(view.name, replace(view.camera, width=view.camera.width - 1))
-    np.testing.assert_array_equal(learner._votes, before)
+    np.testing.assert_array_equal(learner._votes.dense(), before)
     assert learner.views[view.name] is view
 
 
@@ -150,7 +150,7 @@ def test_votes_are_the_sum_over_views_of_what_the_masks_lift() -> None:
     expected = sum(
         lifting(make_operator(SCENE, view.camera), SCENE)[0].T @ onehot[view.read_labels().ravel()] for view in VIEWS
     )
-    np.testing.assert_allclose(learner._votes * VOTE_UNIT, expected, rtol=1e-4, atol=1e-5)
+    np.testing.assert_allclose(learner._votes.dense() * VOTE_UNIT, expected, rtol=1e-4, atol=1e-5)
     seen = expected.sum(axis=1) > 1e-4
     share = expected[seen] / expected[seen].sum(axis=1, keepdims=True)
     np.testing.assert_allclose(learner.codes_[seen], share, atol=1e-3)
@@ -165,7 +165,7 @@ def test_views_taken_back_leave_no_trace_whatever_the_order(order: list[int], ta
     for i in sorted(taken):
         learner.retract(VIEWS[i].name)
     fresh = taught(VoteLearner(SCENE, NUM_CLASSES), [view for i, view in enumerate(VIEWS) if i not in taken])
-    np.testing.assert_array_equal(learner._votes, fresh._votes)
+    np.testing.assert_array_equal(learner._votes.dense(), fresh._votes.dense())
     assert set(learner.views) == set(fresh.views)
     if fresh.views:
         np.testing.assert_array_equal(learner.fit().codes_, fresh.fit().codes_)
@@ -177,7 +177,7 @@ def test_a_view_of_the_same_name_replaces_the_earlier_one(budget: int) -> None:
     other = View.from_arrays(VIEWS[1].camera, np.full_like(VIEWS[1].read_labels(), 3))
     taught(learner, [other])
     fresh = taught(VoteLearner(SCENE, NUM_CLASSES), [VIEWS[0], other, *VIEWS[2:]])
-    np.testing.assert_array_equal(learner._votes, fresh._votes)
+    np.testing.assert_array_equal(learner._votes.dense(), fresh._votes.dense())
     assert len(learner.views) == 5
 
 
@@ -188,10 +188,14 @@ def test_a_mask_that_was_corrected_in_its_file_replaces_what_the_file_held_befor
     learner = taught(VoteLearner(SCENE, NUM_CLASSES, memory_budget=budget), [VIEWS[0], view])
     write_mask(view.source, labels, 8)
     assert learner.observe(view)
-    np.testing.assert_array_equal(learner._votes, taught(VoteLearner(SCENE, NUM_CLASSES), VIEWS[:2])._votes)
+    np.testing.assert_array_equal(
+        learner._votes.dense(), taught(VoteLearner(SCENE, NUM_CLASSES), VIEWS[:2])._votes.dense()
+    )
     write_mask(view.source, np.full_like(labels, 2), 8)
     learner.retract(view.name)
-    np.testing.assert_array_equal(learner._votes, taught(VoteLearner(SCENE, NUM_CLASSES), VIEWS[:1])._votes)
+    np.testing.assert_array_equal(
+        learner._votes.dense(), taught(VoteLearner(SCENE, NUM_CLASSES), VIEWS[:1])._votes.dense()
+    )
 
 
 @pytest.mark.parametrize("kind", [EMLearner, GradientLearner])
@@ -260,7 +264,7 @@ def test_what_was_fitted_to_views_or_classes_that_are_gone_predicts_nothing(kind
 @every_learner
 def test_views_that_cannot_be_used_are_counted_by_reason_and_change_nothing(kind: type[Learner], budget: int) -> None:
     learner = taught(kind(SCENE, NUM_CLASSES, memory_budget=budget), VIEWS[:2])
-    before = learner._votes.copy()
+    before = learner._votes.dense()
     unknown = np.full((48, 64), -1, np.int32)
     away = look_at("away", np.array([0.0, 500.0, 300.0]))
     turned = np.diag([-1.0, 1, -1, 1]) @ away.world_to_camera
@@ -275,7 +279,7 @@ def test_views_that_cannot_be_used_are_counted_by_reason_and_change_nothing(kind
     assert not any(learner.observe(view) for view in useless)
     assert learner.reject_summary() == {"no mask": 2, "all pixels unknown": 2, "sees no Gaussian": 1}
     assert set(learner.rejected) == {view.name for view in useless}
-    np.testing.assert_array_equal(learner._votes, before)
+    np.testing.assert_array_equal(learner._votes.dense(), before)
     assert list(learner.views) == [VIEWS[0].name, VIEWS[1].name]
     assert learner.observe(VIEWS[2]) and VIEWS[2].name not in learner.rejected
 
@@ -297,10 +301,10 @@ def test_no_view_left_is_one_clear_error_that_names_the_reasons(kind: type[Learn
 
 def test_a_label_beyond_the_classes_is_refused_and_changes_nothing() -> None:
     learner = taught(VoteLearner(SCENE, 3), [View.from_arrays(VIEWS[0].camera, np.zeros((48, 64), np.int32))])
-    before = learner._votes.copy()
+    before = learner._votes.dense()
     with pytest.raises(UnknownLabelError, match="label 3; expected at most 2"):
         learner.observe(VIEWS[1])
-    np.testing.assert_array_equal(learner._votes, before)
+    np.testing.assert_array_equal(learner._votes.dense(), before)
     with pytest.raises(MaskSizeError):
         View.from_arrays(VIEWS[1].camera, np.zeros((4, 4), np.int32))
 

@@ -58,7 +58,7 @@ def test_counts_by_the_others_are_those_of_a_slow_twin(seed: int, power: float, 
     views = clean_views(3)
     learner, observation = observed(views, views[1].name)
     shape = learner._votes.shape
-    votes = learner._votes + rng.integers(0, int(UNITS), shape) * (rng.random(shape) < 0.2)
+    votes = learner._votes.dense() + rng.integers(0, int(UNITS), shape) * (rng.random(shape) < 0.2)
     evidence = observation.evidence.without_names(rng.random(len(observation.classes)) < 0.3)
     found = leave_one_out_counts(CSRRows.from_dense(votes), observation, POSSIBLE, evidence, power, most)
     np.testing.assert_allclose(found, slow_count(votes, observation, evidence, power, most), rtol=1e-4, atol=1e-4)
@@ -72,9 +72,9 @@ def test_votes_against_classes_leave_what_can_be_said_with_them(looked_for: list
         found = np.where(np.isin(labels, looked_for), labels, 0)
         views.append(View.from_arrays(view.camera, found, supervised=looked_for))
     learner, observation = observed(views, views[2].name)
-    assert (learner._votes < 0).any()
-    counts = leave_one_out_counts(CSRRows.from_dense(learner._votes), observation, POSSIBLE, observation.evidence, 4.0)
-    expected = slow_count(learner._votes, observation, observation.evidence, 4.0, np.inf)
+    assert (learner._votes.dense() < 0).any()
+    counts = leave_one_out_counts(learner._votes.rows(), observation, POSSIBLE, observation.evidence, 4.0)
+    expected = slow_count(learner._votes.dense(), observation, observation.evidence, 4.0, np.inf)
     np.testing.assert_allclose(counts, expected, rtol=1e-4, atol=1e-4)
     assert counts.any()
 
@@ -82,6 +82,4 @@ def test_votes_against_classes_leave_what_can_be_said_with_them(looked_for: list
 def test_a_view_alone_has_nobody_beside_it() -> None:
     view = clean_views(1)[0]
     learner, observation = observed([view], view.name)
-    assert not leave_one_out_counts(
-        CSRRows.from_dense(learner._votes), observation, POSSIBLE, observation.evidence, 4.0
-    ).any()
+    assert not leave_one_out_counts(learner._votes.rows(), observation, POSSIBLE, observation.evidence, 4.0).any()

@@ -44,10 +44,12 @@ def test_merged_votes_are_those_of_one_robot_that_saw_all_and_every_view_is_kept
     merged = load(tmp_path / "c.npz")
     again = View.from_arrays(replace(VIEWS[3].camera, name="view3_2"), VIEWS[3].read_labels())
     whole = load(robot(tmp_path / "all.npz", [*VIEWS[:4], again, *VIEWS[4:]]))
-    np.testing.assert_array_equal(merged._live._votes, whole._live._votes)
+    np.testing.assert_array_equal(merged._live._votes.dense(), whole._live._votes.dense())
     assert [view.name for view in merged.views] == ["view0", "view1", "view2", "view3", "view3_2", "view4", "view5"]
     merged._live.retract("view3_2")
-    np.testing.assert_array_equal(merged._live._votes, load(robot(tmp_path / "six.npz", VIEWS))._live._votes)
+    np.testing.assert_array_equal(
+        merged._live._votes.dense(), load(robot(tmp_path / "six.npz", VIEWS))._live._votes.dense()
+    )
 
 
 def test_a_session_takes_in_what_others_saved_also_before_its_scene_changed(tmp_path: Path) -> None:
@@ -61,7 +63,7 @@ def test_a_session_takes_in_what_others_saved_also_before_its_scene_changed(tmp_
     whole = LivingSession(session.living, NAMES)
     for view in VIEWS:
         whole.fuse(view)
-    np.testing.assert_array_equal(session._live._votes, whole._live._votes)
+    np.testing.assert_array_equal(session._live._votes.dense(), whole._live._votes.dense())
 
 
 def test_states_that_do_not_belong_together_are_refused_with_one_error_and_nothing_is_written(
@@ -78,10 +80,10 @@ def test_states_that_do_not_belong_together_are_refused_with_one_error_and_nothi
         told = capsys.readouterr().err
         assert message in told and told.count("\n") == 1 and not out.exists()
         session = load(robot(tmp_path / "b.npz", VIEWS[2:]))
-        before = session._live._votes.copy()
+        before = session._live._votes.dense()
         with pytest.raises(Exception, match=Path(other).name):
             session.merge([one, other])
-        np.testing.assert_array_equal(session._live._votes, before)
+        np.testing.assert_array_equal(session._live._votes.dense(), before)
 
 
 def test_a_state_that_is_given_twice_or_is_known_already_is_refused_and_a_later_one_of_the_same_robot_is_not(
@@ -108,10 +110,10 @@ def test_a_state_that_was_merged_already_is_refused_when_it_is_merged_again(tmp_
     session = load(robot(tmp_path / "a.npz", VIEWS[:3]))
     assert session.merge([state]) == len(others)
     session.fuse(VIEWS[4])
-    before = session._live._votes.copy()
+    before = session._live._votes.dense()
     with pytest.raises(StateFileError, match=r"b\.npz: what is known here has all its votes and views already"):
         session.merge([state])
-    np.testing.assert_array_equal(session._live._votes, before)
+    np.testing.assert_array_equal(session._live._votes.dense(), before)
 
 
 def test_objects_that_robots_have_numbered_themselves_are_not_added_up(
@@ -125,10 +127,10 @@ def test_objects_that_robots_have_numbered_themselves_are_not_added_up(
         finder.save(path)
     session = LivingSession(SCENE)
     session.fuse(VIEWS[0])
-    before = session._live._votes.copy()
+    before = session._live._votes.dense()
     with pytest.raises(StateFileError, match=r"a\.npz: holds objects that its own session found and numbered"):
         session.merge(robots[:1])
-    np.testing.assert_array_equal(session._live._votes, before)
+    np.testing.assert_array_equal(session._live._votes.dense(), before)
     assert main(["merge", *robots, "-o", str(tmp_path / "c.npz")]) == 2
     assert "a.npz: holds objects that" in capsys.readouterr().err and not (tmp_path / "c.npz").exists()
 

@@ -95,7 +95,7 @@ def test_what_is_rejected_has_no_say_against_others() -> None:
         near = ndimage.binary_dilation(view.read_labels() == 1, iterations=12)
         views.append(View.from_arrays(view.camera, np.where(near, UNKNOWN, view.read_labels())))
     learner = taught(EMLearner(SCENE, NUM_CLASSES + 1), views)
-    votes, evidence = CSRRows.from_dense(learner._votes), learner.observation(right.name).evidence
+    votes, evidence = learner._votes.rows(), learner.observation(right.name).evidence
     _, at_first = learner._find_rejected(votes, lambda: None, dict.fromkeys(learner.views))
     assert evidence.named()[at_first[right.name]].tolist() == [1]
     _, rejected = learner._reject_regions(votes, lambda: None)
@@ -113,7 +113,7 @@ def test_gaussians_of_which_only_doubtful_regions_speak_have_no_code() -> None:
         near = ndimage.binary_dilation(view.read_labels() == 1, iterations=9)
         views.append(View.from_arrays(view.camera, np.where(near, UNKNOWN, view.read_labels())))
     learner = taught(EMLearner(SCENE, NUM_CLASSES), views).fit()
-    voted = learner._votes.any(axis=1)
+    voted = learner._votes.dense().any(axis=1)
     assert (voted & ~learner.observed_).any()
     np.testing.assert_array_equal(learner.codes_.any(axis=1), learner.observed_)
     assert (learner.observed_ <= voted).all()
@@ -124,7 +124,7 @@ def test_a_region_is_rejected_only_where_the_others_saw_enough_of_it(seen: float
     view = clean_views(1)[0]
     learner = EMLearner(SCENE, NUM_CLASSES + 1)
     learner.observe(view)
-    votes = learner._votes.copy()
+    votes = learner._votes.dense()
     votes[:, NUM_CLASSES] = seen * votes.sum(axis=1)  # all is one more class to the others
     observation, possible = learner._prepared.in_memory[view.name], np.ones(NUM_CLASSES + 1, bool)
     rejected = find_rejected(CSRRows.from_dense(votes), observation, possible, EMSettings().least_agreement)
@@ -137,7 +137,7 @@ def test_one_other_class_speaks_against_a_label_more_than_many(rivals: int, expe
     view = clean_views(1)[0]
     learner = EMLearner(SCENE, NUM_CLASSES + rivals)
     learner.observe(view)
-    votes = learner._votes.copy()
+    votes = learner._votes.dense()
     others = votes[:, :NUM_CLASSES].sum(axis=1)
     votes[:, :NUM_CLASSES] += (0.07 * votes[:, :NUM_CLASSES]).astype(np.int64)
     votes[:, NUM_CLASSES:] = (0.93 / rivals * others)[:, None]
@@ -189,7 +189,7 @@ def test_soft_masks_of_all_classes_are_learnt_from_as_what_they_hold_likeliest()
     assert one.rejected_share(soft[0]) == two.rejected_share(hard[0]) > 0
     for view in soft:
         one.retract(view.name)
-    assert not one._votes.any()
+    assert not one._votes.dense().any()
 
 
 def test_views_come_and_go_exactly_with_regions_too() -> None:
@@ -199,14 +199,16 @@ def test_views_come_and_go_exactly_with_regions_too() -> None:
         learner.fit()
         for view in views[1:]:
             learner.retract(view.name)
-        np.testing.assert_array_equal(learner._votes, taught(EMLearner(SCENE, NUM_CLASSES), views[:1])._votes)
+        np.testing.assert_array_equal(
+            learner._votes.dense(), taught(EMLearner(SCENE, NUM_CLASSES), views[:1])._votes.dense()
+        )
         learner.retract(views[0].name)
-        assert not learner._votes.any()
+        assert not learner._votes.dense().any()
 
 
 def test_votes_by_region_are_the_votes() -> None:
     views = [with_clutter(view) for view in clean_views(4)]
-    em, votes = (taught(make(SCENE, NUM_CLASSES), views)._votes for make in (EMLearner, VoteLearner))
+    em, votes = (taught(make(SCENE, NUM_CLASSES), views)._votes.dense() for make in (EMLearner, VoteLearner))
     np.testing.assert_allclose(em, votes, rtol=1e-6, atol=2 * len(views))  # each sighting is rounded once
 
 

@@ -77,7 +77,7 @@ def test_one_hot_probabilities_teach_exactly_what_the_plain_mask_does(name: str)
     views = wrong_views(4)
     one, two = learnt(name, views), learnt(name, [View.from_probabilities(v.camera, one_hot(v)) for v in views])
     np.testing.assert_array_equal(one.codes_, two.codes_)
-    np.testing.assert_array_equal(one._votes, two._votes)
+    np.testing.assert_array_equal(one._votes.dense(), two._votes.dense())
 
 
 @pytest.mark.parametrize("name", LEARNERS)
@@ -85,7 +85,7 @@ def test_prototypes_teach_what_their_classes_do(name: str) -> None:
     """The way of soft masks, with a mask that is not soft: equal but for rounding, votes exactly."""
     views = wrong_views(4)
     one, two = learnt(name, views), learnt(name, [in_prototypes(view) for view in views])
-    np.testing.assert_allclose(one._votes * VOTE_UNIT, two._votes * VOTE_UNIT, atol=1e-3)
+    np.testing.assert_allclose(one._votes.dense() * VOTE_UNIT, two._votes.dense() * VOTE_UNIT, atol=1e-3)
     np.testing.assert_allclose(one.codes_, two.codes_, atol=2e-3)
     np.testing.assert_array_equal(one.observed_, two.observed_)
 
@@ -99,7 +99,7 @@ def test_soft_votes_are_weights_times_masses_by_a_slow_twin() -> None:
     W, _ = lifting(make_operator(SCENE, view.camera), SCENE)
     said = seen.evidence.votes.dense(NUM_CLASSES)[seen.labels.ravel()]
     learner = taught(VoteLearner(SCENE, NUM_CLASSES), [view])
-    np.testing.assert_allclose(learner._votes * VOTE_UNIT, W.T @ said, atol=2e-3)
+    np.testing.assert_allclose(learner._votes.dense() * VOTE_UNIT, W.T @ said, atol=2e-3)
 
 
 @given(st.lists(st.integers(0, 8), min_size=1, max_size=6, unique=True), st.randoms(use_true_random=False))
@@ -116,7 +116,7 @@ def test_votes_are_additive_and_retracted_bit_for_bit(kept: list[int], random: o
         one.retract(kinds[i].name)
     for i in kept:
         two.observe(kinds[i])
-    np.testing.assert_array_equal(one._votes, two._votes)
+    np.testing.assert_array_equal(one._votes.dense(), two._votes.dense())
 
 
 @pytest.mark.parametrize("name", LEARNERS)
@@ -236,7 +236,9 @@ def test_where_several_classes_are_left_they_share_by_how_frequent_they_are() ->
     votes = np.array([[0, -2, -2]] * 60 + [[0, 3, -1]] * 10 + [[0, -1, 3]] * 10 + [[0, -1, 0]] * 4 + [[0, 0, 0]])
     codes = np.eye(3, dtype=np.float32)[[0] * 60 + [1] * 10 + [2] * 10 + [0] * 5]
     codes[80:] = 0
-    codes = impute_probabilities(CSRRows.from_dense(codes), votes, possible, np.arange(80, 84)).dense(3)
+    codes = impute_probabilities(
+        CSRRows.from_dense(codes), CSRRows.from_dense(votes), possible, np.arange(80, 84)
+    ).dense(3)
     np.testing.assert_allclose(codes[80:84, 0] / codes[80:84, 2], 6, rtol=1e-3)
     np.testing.assert_array_equal(codes[80:84, 1], 0)
     np.testing.assert_array_equal(codes[84], 0)

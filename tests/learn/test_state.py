@@ -40,12 +40,12 @@ def saved(tmp_path: Path) -> Path:
 
 def assert_refused(learner: Learner, path: Path, error: type[Exception]) -> None:
     """The learner holds one view before, and the very same after."""
-    before, votes = dict(learner.views), learner._votes.copy()
+    before, votes = dict(learner.views), learner._votes.dense()
     with pytest.raises(error, match=path.name) as caught:
         restore(learner, path)
     assert "\n" not in str(caught.value)
     assert learner.views == before
-    np.testing.assert_array_equal(learner._votes, votes)
+    np.testing.assert_array_equal(learner._votes.dense(), votes)
     learner.fit()
 
 
@@ -60,17 +60,17 @@ def test_a_saved_state_comes_back_exactly_and_can_be_added_to_and_taken_from(sav
     np.testing.assert_array_equal(restored.fit().codes_, original.fit().codes_)
     for learner in (original, restored):
         learner.retract(VIEWS[1].name)
-    np.testing.assert_array_equal(restored._votes, original._votes)
+    np.testing.assert_array_equal(restored._votes.dense(), original._votes.dense())
     for view in (VIEWS[0], VIEWS[2]):
         restored.retract(view.name)
-    assert not restored._votes.any()
+    assert not restored._votes.dense().any()
 
 
 def test_a_learner_without_views_can_be_saved_and_restored(tmp_path: Path) -> None:
     save(fresh(), tmp_path / "empty.npz")
     learner = taught(fresh(), VIEWS[:1])
     restore(learner, tmp_path / "empty.npz")
-    assert not learner.views and not learner._votes.any()
+    assert not learner.views and not learner._votes.dense().any()
 
 
 def test_a_state_of_another_scene_is_refused(saved: Path) -> None:
@@ -94,7 +94,7 @@ def test_a_missing_empty_truncated_or_foreign_file_is_refused_and_changes_nothin
 
 def test_flipped_bytes_anywhere_are_refused_or_do_no_harm(saved: Path) -> None:
     learner, content = taught(fresh(), VIEWS[:1]), saved.read_bytes()
-    reference = taught(fresh(), VIEWS)._votes
+    reference = taught(fresh(), VIEWS)._votes.dense()
     for place in np.linspace(0, len(content) - 1, 150).astype(int):
         broken = bytearray(content)
         broken[place] ^= 0xFF
@@ -105,7 +105,7 @@ def test_flipped_bytes_anywhere_are_refused_or_do_no_harm(saved: Path) -> None:
         except (StateFileError, StateMismatchError):
             assert learner._votes is before
         else:
-            np.testing.assert_array_equal(learner._votes, reference)
+            np.testing.assert_array_equal(learner._votes.dense(), reference)
 
 
 def test_a_failed_save_leaves_the_earlier_state_whole(saved: Path, monkeypatch: pytest.MonkeyPatch) -> None:

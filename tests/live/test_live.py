@@ -67,7 +67,7 @@ def test_classes_turn_up_with_their_labels_unless_they_were_declared() -> None:
 
 
 def test_a_label_that_would_take_too_much_memory_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(session_classes, "VOTES_LIMIT", 8 * len(SCENE) * 10)
+    monkeypatch.setattr(session_classes, "VOTES_LIMIT", 4 * 3 * 10)  # of a table of three blocks of Gaussians
     session = LiveSession(SCENE)
     assert session.fuse(blank(VIEWS[0], 9)) is None
     rejection = session.fuse(blank(VIEWS[1], 10))
@@ -80,7 +80,7 @@ def test_neither_a_dataset_nor_a_state_brings_more_classes_than_there_is_memory_
 ) -> None:
     fed(LiveSession(SCENE)).save(tmp_path / "state.npz")
     data = Dataset(write_dataset(tmp_path / "data"))
-    monkeypatch.setattr(session_classes, "VOTES_LIMIT", 8 * len(SCENE) * 3)
+    monkeypatch.setattr(session_classes, "VOTES_LIMIT", 4 * 3 * 3)
     session = LivingSession(SCENE)
     for take_in in (session.load, lambda path: session.merge([path])):
         with pytest.raises(StateFileError, match="holds 4 classes; expected at most 3 for a scene of 626 Gaussians"):
@@ -148,9 +148,9 @@ def test_a_view_of_a_name_that_is_kept_takes_its_place_and_all_counts_agree(tmp_
 def test_a_name_that_is_not_kept_any_more_is_that_of_another_view() -> None:
     session = fed(LiveSession(SCENE, NAMES, max_views=1), [VIEWS[0], VIEWS[1], VIEWS[0]])
     assert (session.num_fused, session.num_views) == (3, 1)
-    once = fed(LiveSession(SCENE, NAMES), VIEWS[:2])._live._votes
-    twice = once + fed(LiveSession(SCENE, NAMES), VIEWS[:1])._live._votes
-    np.testing.assert_array_equal(session._live._votes, twice)
+    once = fed(LiveSession(SCENE, NAMES), VIEWS[:2])._live._votes.dense()
+    twice = once + fed(LiveSession(SCENE, NAMES), VIEWS[:1])._live._votes.dense()
+    np.testing.assert_array_equal(session._live._votes.dense(), twice)
 
 
 @pytest.mark.parametrize("forget", ["reset", "load"])

@@ -23,7 +23,7 @@ NONE = np.empty(0, np.int64)
 
 
 def votes(session: LivingSession) -> np.ndarray:
-    return session._live._votes
+    return session._live._votes.dense()
 
 
 def refused_into(session: LivingSession) -> LivingSession:

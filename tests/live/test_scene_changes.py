@@ -45,7 +45,7 @@ def session(group: int | None = None) -> LivingSession:
 
 
 def votes(of: LivingSession) -> np.ndarray:
-    return of._live._votes
+    return of._live._votes.dense()
 
 
 def other_room(shift: tuple[float, float, float], group: int = 1) -> SceneDelta:
@@ -296,7 +296,7 @@ def test_a_session_without_groups_has_the_views_of_a_state_where_these_have_gone
     assert plain.learn("votes").learnt.num_views == 4, "all are seen from where they are"
     for view in posed:
         assert plain.fuse(view) is None, "which takes back what was loaded, and adds the same"
-    np.testing.assert_array_equal(plain._live._votes, fused._live._votes)
+    np.testing.assert_array_equal(plain._live._votes.dense(), fused._live._votes.dense())
 
 
 def test_a_state_of_another_scene_with_ids_is_refused_where_ids_are_but_numbers(tmp_path: Path) -> None:

@@ -67,7 +67,7 @@ def requests(session: LiveSession, draw: random.Random, folder: Path) -> dict[st
 def everything(session: LiveSession) -> list[object]:
     codes = session.codes().tobytes() if session.has_codes else None
     views, names = list(session._live.views.items()), (dict(session._classes.names), session.class_names)
-    return [session._live._votes.tobytes(), codes, names, views, session.num_fused, session.learnt, session.era]
+    return [session._live._votes.dense().tobytes(), codes, names, views, session.num_fused, session.learnt, session.era]
 
 
 def assert_counts_agree(session: LiveSession) -> None:

@@ -25,6 +25,7 @@ from small_scenes import (
 )
 
 from gsseg_core.cli.main import main
+from gsseg_core.csr_rows import CSRRows
 from gsseg_core.data.dataset import Dataset
 from gsseg_core.data.label_images import UNKNOWN, read_mask, write_mask
 from gsseg_core.data.view import View
@@ -59,7 +60,7 @@ def test_views_that_are_not_there_and_votes_that_are_none_are_refused_and_nothin
         with pytest.raises(SettingsError, match="view 'nowhere' was not added; there are 1 others"):
             use("nowhere")
     with pytest.raises(SceneValueError, match=r"objects: votes have shape .*; expected \(626, K\), finite"):
-        table.recall(votes)
+        table.recall(CSRRows.from_dense(votes))
     np.testing.assert_array_equal(table.relabelled(VIEWS[0]).read_labels(), before)
 
 

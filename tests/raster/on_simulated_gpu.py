@@ -29,6 +29,7 @@ from gsseg_core.raster.gpu.tensors import RowTensors
 from gsseg_core.raster.observation import Observation
 from gsseg_core.raster.view_operator import ViewOperator
 from gsseg_core.raster.view_renderer import PixelGrid
+from gsseg_core.raster.vote_total import VoteTotal
 from gsseg_core.scene.gaussian_scene import GaussianScene
 
 WIDTH, HEIGHT, CLASSES = 19, 13, 6  # two tiles, one of them cut off
@@ -137,12 +138,14 @@ def test_a_lifted_mask_and_the_pixels_of_a_grid_are_those_of_the_cpu() -> None:
 def test_votes_of_many_views_are_summed_where_they_lie_and_end_on_the_cpu(
     fits: bool, monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    monkeypatch.setattr(gpu_operator, "_COPIED", 100)  # in several blocks
     if not fits:
         monkeypatch.setattr(gpu_operator, "free_memory_on", lambda device: 1)
     prototypes = (np.unique(MASK, return_inverse=True)[1].reshape(MASK.shape) - 1).astype(np.int32)
     evidence = LabelEvidence(np.arange(3, dtype=np.int32), RNG.random((prototypes.max() + 1, 3), np.float32))
     views = [(random_mask(5, WIDTH, HEIGHT, range(CLASSES)), None), (prototypes, evidence)]
-    ours, theirs = (np.full((len(SCENE), CLASSES), 7) for _ in range(2))
+    before = np.full((len(SCENE), CLASSES), 7)
+    ours, theirs = (VoteTotal.from_rows(CSRRows.from_dense(before), CLASSES) for _ in range(2))
     cpu, gpu = operators()
     with vote_total(theirs, "cuda") as total:
         assert isinstance(total, torch.Tensor) == fits
@@ -150,11 +153,11 @@ def test_votes_of_many_views_are_summed_where_they_lie_and_end_on_the_cpu(
             gpu.observe(mask, means).vote(total, UNITS)
     for mask, means in views:
         cpu.observe(mask, means).vote(ours, UNITS)
-    np.testing.assert_allclose(theirs, ours, atol=1e-5 * UNITS)
+    np.testing.assert_allclose(theirs.dense(), ours.dense(), atol=1e-5 * UNITS)
     with vote_total(theirs, "cuda") as total:
         for mask, means in views:
             gpu.observe(mask, means).vote(total, UNITS, -1)
-    assert (theirs == 7).all()
+    assert (theirs.dense() == 7).all()
 
 
 def test_objects_alone_have_the_reasons_of_the_cpu() -> None:

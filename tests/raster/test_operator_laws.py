@@ -16,6 +16,7 @@ from operator_cases import dense, make_camera, make_scene, moved, random_mask, r
 from gsseg_core.data.label_evidence import LabelEvidence
 from gsseg_core.learn.learner import UNITS
 from gsseg_core.raster.view_renderer import PixelGrid
+from gsseg_core.raster.vote_total import VoteTotal
 from gsseg_core.scene.camera import Camera
 
 views = st.fixed_dictionaries(
@@ -242,12 +243,12 @@ def test_votes_that_keep_nothing_of_a_view_are_those_of_its_observation_to_the_l
         mass = np.random.default_rng(view["seed"]).dirichlet(np.ones(3), mask.max() + 1)[:, :2]
         evidence = LabelEvidence(np.array([1, 5], np.int32), mass.astype(np.float32), np.array([1, 4, 5], np.int32))
     observation = operator.observe(mask, evidence)
-    expected, found = np.zeros((2, len(scene), 9), np.int64)
+    expected, found = (VoteTotal(len(scene), 9) for _ in range(2))
     observation.vote(expected, UNITS)
     assert operator.vote(mask, evidence, found, UNITS) == (len(observation.ids) > 0)
-    np.testing.assert_array_equal(found, expected)
+    np.testing.assert_array_equal(found.dense(), expected.dense())
     operator.vote(mask, evidence, found, UNITS, -1)
-    assert not found.any()
+    assert not found.dense().any()
 
 
 @few

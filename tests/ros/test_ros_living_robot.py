@@ -83,6 +83,7 @@ def test_changes_by_request_and_topic_between_masks_states_and_merging_end_in_th
     for view in state.views:
         assert fresh.fuse(view) is None
     assert len(state.views) == state.num_fused >= 30 and {view.group for view in state.views} >= {0, None}
-    np.testing.assert_array_equal(np.asarray(state.votes), np.asarray(fresh._live.state().votes))
+    for found, expected in zip(state.votes, fresh._live.state().votes, strict=True):
+        np.testing.assert_array_equal(found, expected)
     refused = str(CHANGES // 2)
     robot.wait_for_status(lambda status: status.get("scene changes: refused") == refused, "the refused changes")

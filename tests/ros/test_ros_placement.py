@@ -93,8 +93,8 @@ def test_after_any_moves_votes_are_those_of_views_that_came_at_the_last_place(pl
     expected = LivingSession(SCENE, session.class_names)
     for view in placed_views(views, places[-1]):
         expected.fuse(view)
-    found = session._live._votes
-    np.testing.assert_allclose(found, expected._live._votes, rtol=0, atol=2e-3 * abs(found).max() + 1)
+    found = session._live._votes.dense()
+    np.testing.assert_allclose(found, expected._live._votes.dense(), rtol=0, atol=2e-3 * abs(found).max() + 1)
     if places[-1] is FAR:
         assert not found.any() and expected.num_fused == 0, "nothing is seen from there, and nothing is lost"
         return

@@ -70,7 +70,7 @@ def here(module_here: NodeHere) -> NodeHere:
 
 
 def votes(session: LivingSession) -> np.ndarray:
-    return session._live._votes
+    return session._live._votes.dense()
 
 
 def as_refused(session: LivingSession) -> np.ndarray:

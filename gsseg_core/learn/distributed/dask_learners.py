@@ -73,7 +73,7 @@ class _OnWorkers(Learner):
             votes, why = self._sum(dask_worker.sum_votes, named, lambda done: progress("observe", done, len(named)))
             for name, view in named.items():
                 self._add(view, UnusableViewError(why[name]) if why[name] else None)
-            self._votes += votes
+            self._votes.add_rows(dask_worker.as_compiled_for(votes))
         progress("observe", len(named), len(named))
 
     def _sum(

@@ -22,11 +22,12 @@ from gsseg_core.errors import GssegError
 from gsseg_core.learn.em.confusion_model import ErrorModel
 from gsseg_core.learn.em.em_learner import EMLearner, EMSettings
 from gsseg_core.learn.learner import UNITS, UnusableViewError
+from gsseg_core.raster.vote_total import VoteTotal
 from gsseg_core.scene.gaussian_scene import GaussianScene
 from gsseg_core.scene.vertices import DC
 
 Part = tuple[Any, dict[str, Any]]
-"""A sum over some views, of int64, or None, and by view what else came out."""
+"""A sum over some views, of int64, perhaps sparse, or None; and by view what else came out."""
 
 ONLY_VOTES = EMSettings(errors=False)  # what is wrong with a mask does not matter to votes
 
@@ -71,7 +72,7 @@ def prepare(
 ) -> Shard:  # fmt: skip
     """Prepare views, by settings or, without, for votes; `where` is the learner's device and memory budget."""
     shard = Shard(scene, num_classes, settings or ONLY_VOTES, **where)
-    shard._votes = shard._votes[:0].copy()
+    shard._votes = VoteTotal(0, num_classes)
     with _all_threads():
         for view in views:
             opened = shard._opened(view)
@@ -85,31 +86,31 @@ def prepare(
 
 def sum_votes(shard: Shard, wanted: dict[str, Any]) -> Part:
     """Count votes; beside them, why a view was rejected, or ""."""
-    votes = np.zeros((len(shard.scene), shard.num_classes), np.int64)
+    votes = VoteTotal(len(shard.scene), shard.num_classes)
     with _all_threads():
         for name in wanted:
             if name in shard.views:
                 shard.observation(name).vote(votes, UNITS)
-    return votes, {name: shard.rejected.get(name, "") for name in wanted}
+    return votes.rows(), {name: shard.rejected.get(name, "") for name in wanted}
 
 
 def find_rejected(shard: Shard, doubted: dict[str, np.ndarray | None], votes: CSRRows) -> Part:
     """Sum the votes of rejected regions; beside them, which labels of each view these are."""
     with _all_threads():
-        return shard._find_rejected(_as_compiled_for(votes), _go_on, doubted)
+        return shard._find_rejected(as_compiled_for(votes), _go_on, doubted)
 
 
 def initial_error_models(shard: Shard, rejected: dict[str, np.ndarray | None], votes: CSRRows) -> Part:
     """Estimate the first error model of each view."""
     known = {name: labels for name, labels in rejected.items() if labels is not None}
     with _all_threads():
-        return None, shard._initial_error_models(_as_compiled_for(votes), known, _go_on, rejected)
+        return None, shard._initial_error_models(as_compiled_for(votes), known, _go_on, rejected)
 
 
 def e_step(shard: Shard, models: dict[str, ErrorModel], codes: CSRRows) -> Part:
     """Sum the gradient of the log-likelihood; beside it, each view's log-likelihood."""
     with _all_threads():
-        return shard._e_step(_as_compiled_for(codes), models, _go_on)
+        return shard._e_step(as_compiled_for(codes), models, _go_on)
 
 
 def refit_error_models(
@@ -117,7 +118,7 @@ def refit_error_models(
 ) -> Part:  # fmt: skip
     """Re-estimate the views' error models."""
     with _all_threads():
-        return None, shard._refit_error_models(_as_compiled_for(codes), gradient, prior, deepcopy(models), _go_on)
+        return None, shard._refit_error_models(as_compiled_for(codes), gradient, prior, deepcopy(models), _go_on)
 
 
 def hand_on(value: Any) -> Any:
@@ -127,7 +128,11 @@ def hand_on(value: Any) -> Any:
 
 def add(one: Part, two: Part) -> Part:
     """Add two sums over different views."""
-    return None if one[0] is None else one[0] + two[0], {**one[1], **two[1]}
+    if isinstance(one[0], CSRRows):
+        total: Any = as_compiled_for(one[0]).plus(as_compiled_for(two[0]))
+    else:
+        total = None if one[0] is None else one[0] + two[0]
+    return total, {**one[1], **two[1]}
 
 
 @contextmanager
@@ -141,7 +146,7 @@ def _all_threads() -> Iterator[None]:
         yield
 
 
-def _as_compiled_for(rows: CSRRows) -> CSRRows:
+def as_compiled_for(rows: CSRRows) -> CSRRows:
     """Kernels would be compiled once more for arrays that cannot be written to, as those from the network may be."""
     return CSRRows(*(np.require(array, requirements=["C", "W"]) for array in rows))
 

@@ -177,39 +177,3 @@ def _count_confusions(codes: CSRRows, pairs: ViewPairs, shares: np.ndarray, part
             for s in range(start[m], start[m + 1]):
                 for z in range(indptr[m], indptr[m + 1]):
                     part[classes[z], labels[s]] += shares[s] * data[z]
-
-
-@kernel(parallel=True)
-def normalise_votes(votes: np.ndarray, possible: np.ndarray, codes: np.ndarray) -> int:
-    """Divide the votes (N, K) int64 for classes by their sum, into codes (N, K) float32; rows of zeros stay zero.
-
-    Votes below 0 are against a class. Where there are only such, the one class without any is certain; where several of
-    the `possible`, (K,) bool, have none, the row is left zero. Returns how many rows these are.
-    """
-    unsure = 0
-    for i in nb.prange(votes.shape[0]):
-        total, against, free, left = np.int64(0), False, 0, -1
-        for k in range(votes.shape[1]):
-            total += max(votes[i, k], 0)
-            against |= votes[i, k] < 0
-            if votes[i, k] == 0 and possible[k]:
-                free, left = free + 1, k
-        for k in range(votes.shape[1]):
-            codes[i, k] = max(votes[i, k], 0) / total if total > 0 else 0.0
-        if total == 0 and against:
-            if free == 1:
-                codes[i, left] = 1.0
-            else:
-                unsure += 1
-    return unsure
-
-
-@kernel(parallel=True)
-def weigh_votes(votes: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Sum of the sizes of votes (N, K) int64, for and against classes, and the least of them and 0, (N,) int64 each."""
-    total, least = np.zeros(votes.shape[0], np.int64), np.zeros(votes.shape[0], np.int64)
-    for i in nb.prange(votes.shape[0]):
-        for k in range(votes.shape[1]):
-            total[i] += abs(votes[i, k])
-            least[i] = min(least[i], votes[i, k])
-    return total, least

@@ -169,7 +169,7 @@ class EMLearner(Learner):
         """Alternate E and M steps until a step can gain no more than the tolerance."""
         settings = self.settings
         self._require_views()
-        votes, tick = CSRRows.from_dense(self._votes), partial(progress, "em", 0, settings.max_steps)
+        votes, tick = self._votes.rows(), partial(progress, "em", 0, settings.max_steps)
         # All neighbours of a scene are found once; while a GPU tests regions, the CPU is free for that.
         search = partial(find_neighbours, self.scene, settings.prior_k)
         with meanwhile(search, self.device) if settings.prior_weight else nullcontext():

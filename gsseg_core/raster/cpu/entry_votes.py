@@ -5,29 +5,33 @@ from __future__ import annotations
 import numba as nb
 import numpy as np
 
-from gsseg_core.csr_rows import CSRRows
-from gsseg_core.data.label_evidence import LabelEvidence, vote_units
+from gsseg_core.data.label_evidence import LabelEvidence
 from gsseg_core.kernels.compiler import kernel
 from gsseg_core.raster.constants import CHUNKS
 from gsseg_core.raster.cpu.lifting import Lifted
 from gsseg_core.raster.cpu.tiling import Tiles
+from gsseg_core.raster.vote_total import PairVotes, VoteTotal
 from gsseg_core.simd import AHEAD, prefetch
-
-WAITING = 64  # votes that are put together before they are counted: where they go has come into the cache by then
 
 
 def add_entry_votes(
-    total: np.ndarray, ids: np.ndarray,  # (N, K) int64, added to; (M,) int32, distinct
-    tiles: Tiles, lifted: Lifted, evidence: LabelEvidence, units: float, sign: int,  # units per vote; a power of 2
+    total: VoteTotal, ids: np.ndarray,  # added to; (M,) int32, distinct
+    tiles: Tiles, lifted: Lifted, evidence: LabelEvidence, units: float, sign: int,  # units per px; a power of 2
 ) -> None:  # fmt: skip
-    """Add a view's votes to those of others, bit for bit as `raster.observation.add_votes` does with pairs."""
+    """Add a view's votes to those of others, bit for bit as `raster.observation.Observation.vote` does with pairs."""
     if not len(lifted.classes):
         return
     labels = lifted.labels
     count = np.diff(labels.start)
     facts = np.stack([count, lifted.slot_start[:-1] - tiles.start[:-1] * count, labels.start[:-1]], axis=1)
-    votes = _pack(tiles.start, facts, lifted.sums, labels.present)
-    _vote(total, ids, tiles, facts, votes, lifted.sums, labels.present, evidence.votes, units, sign)
+    packed = _pack(tiles.start, facts, lifted.sums, labels.present)
+    # A chunk has at most one pair for each sum above zero: one for each of its entries, and `extra` more if all entries
+    # that have several are in this chunk; and it looks at the place after its last.
+    extra = lifted.counts[:, 3].sum() - lifted.counts[:, 0].sum() + 1
+    chunks = np.arange(CHUNKS + 1)
+    capacity = tiles.gaussian_start[chunks * len(ids) // CHUNKS] + extra * chunks
+    cast = _list_pairs(ids, tiles, facts, packed, lifted.sums, labels.present, len(lifted.classes), capacity)
+    total.add(cast, evidence.votes, units, sign)
 
 
 @kernel(parallel=True)
@@ -57,60 +61,44 @@ def _pack(start: np.ndarray, facts: np.ndarray, sums: np.ndarray, present: np.nd
 
 
 @kernel(parallel=True)
-def _vote(
-    total: np.ndarray, ids: np.ndarray, tiles: Tiles,  # (N, K) int64, added to; (M,) int32
-    facts: np.ndarray, entry_votes: np.ndarray, sums: np.ndarray, present: np.ndarray,  # as in `_pack`
-    label_votes: CSRRows, units: float, sign: int,  # L rows, float64: what a pixel of each label votes
-) -> None:  # fmt: skip
-    count, last, num_labels = ids.shape[0], tiles.gaussian_entries.shape[0] - 1, label_votes.indptr.shape[0] - 1
-    flat, classes = total.reshape(-1), total.shape[1]
+def _list_pairs(
+    ids: np.ndarray, tiles: Tiles,  # (M,) int32
+    facts: np.ndarray, packed: np.ndarray, sums: np.ndarray, present: np.ndarray,  # as in `_pack`, and made by it
+    num_labels: int, capacity: np.ndarray,  # (CHUNKS + 1,) where each chunk's pairs begin; there is more than needed
+) -> PairVotes:  # fmt: skip
+    """Sum up the votes of each Gaussian and label."""
+    count, last = ids.shape[0], tiles.gaussian_entries.shape[0] - 1
+    who, labels = np.empty(capacity[-1], np.int32), np.empty(capacity[-1], np.int32)
+    votes, parts = np.empty(capacity[-1], np.float32), np.empty((CHUNKS, 2), np.int64)
     for chunk in nb.prange(CHUNKS):
-        first, end = chunk * count // CHUNKS, (chunk + 1) * count // CHUNKS
-        seen, place = np.full(num_labels, -1, np.int64), np.zeros(num_labels, np.int64)
-        who, labels = np.empty(WAITING + num_labels, np.int32), np.empty(WAITING + num_labels, np.int32)
-        votes, n = np.empty(WAITING + num_labels, np.float32), 0
-        for g in range(first, end):
+        seen, place, n = np.full(num_labels, -1, np.int64), np.zeros(num_labels, np.int64), capacity[chunk]
+        for g in range(chunk * count // CHUNKS, (chunk + 1) * count // CHUNKS):
             # Most Gaussians have one label in all their tiles: nothing is decided for those.
             name, vote, alone = np.float32(0), np.float32(0), True
             for i in range(tiles.gaussian_start[g], tiles.gaussian_start[g + 1]):
-                prefetch(entry_votes, tiles.gaussian_entries[min(i + 2 * AHEAD, last)])
+                prefetch(packed, tiles.gaussian_entries[min(i + 2 * AHEAD, last)])
                 e = tiles.gaussian_entries[i]
-                weight = entry_votes[e, 1]
-                name = name if vote > 0 else entry_votes[e, 0]
-                alone &= (weight == 0) | ((entry_votes[e, 0] == name) & (name >= 0))
+                weight = packed[e, 1]
+                name = name if vote > 0 else packed[e, 0]
+                alone &= (weight == 0) | ((packed[e, 0] == name) & (name >= 0))
                 vote += weight
             if alone:
-                label = int(max(name, np.float32(0)))
-                who[n], labels[n], votes[n] = ids[g], label, vote
+                who[n], labels[n], votes[n] = ids[g], int(max(name, np.float32(0))), vote
                 n += int(vote > 0)
-                _fetch(flat, classes, ids[g], label, label_votes)
-            else:
-                for i in range(tiles.gaussian_start[g], tiles.gaussian_start[g + 1]):
-                    e = tiles.gaussian_entries[i]
-                    tile = int(-1 - entry_votes[e, 0])
-                    slots = int(facts[tile, 0]) if tile >= 0 else 1
-                    for j in range(slots if entry_votes[e, 1] > 0 else 0):
-                        weight = sums[e * slots + facts[tile, 1] + j] if tile >= 0 else entry_votes[e, 1]
-                        if not weight > 0:
-                            continue
-                        label = int(present[facts[tile, 2] + j] if tile >= 0 else entry_votes[e, 0])
-                        if seen[label] != g:
-                            seen[label], place[label] = g, n
-                            who[n], labels[n], votes[n] = ids[g], label, 0.0
-                            n += 1
-                            _fetch(flat, classes, ids[g], label, label_votes)
-                        votes[place[label]] += weight
-            if n < WAITING and g < end - 1:
                 continue
-            for s in range(n):
-                row = total[who[s]]
-                for z in range(label_votes.indptr[labels[s]], label_votes.indptr[labels[s] + 1]):
-                    row[label_votes.indices[z]] += sign * vote_units(votes[s], label_votes.data[z], units)
-            n = 0
-
-
-@nb.njit(inline="always")
-def _fetch(flat: np.ndarray, classes: int, i: int, label: int, label_votes: CSRRows) -> None:
-    """Ask for where the first vote of a label for a Gaussian goes."""
-    if label_votes.indptr[label] < label_votes.indptr[label + 1]:
-        prefetch(flat, i * classes + label_votes.indices[label_votes.indptr[label]])
+            for i in range(tiles.gaussian_start[g], tiles.gaussian_start[g + 1]):
+                e = tiles.gaussian_entries[i]
+                tile = int(-1 - packed[e, 0])
+                slots = int(facts[tile, 0]) if tile >= 0 else 1
+                for j in range(slots if packed[e, 1] > 0 else 0):
+                    weight = sums[e * slots + facts[tile, 1] + j] if tile >= 0 else packed[e, 1]
+                    if not weight > 0:
+                        continue
+                    label = int(present[facts[tile, 2] + j] if tile >= 0 else packed[e, 0])
+                    if seen[label] != g:
+                        seen[label], place[label] = g, n
+                        who[n], labels[n], votes[n] = ids[g], label, 0.0
+                        n += 1
+                    votes[place[label]] += weight
+        parts[chunk, 0], parts[chunk, 1] = capacity[chunk], n
+    return PairVotes(who, labels, votes, parts)

@@ -24,6 +24,7 @@ from gsseg_core.raster.objects_alone import ObjectsAlone
 from gsseg_core.raster.observation import LabelWeights, Observation, VoteShares
 from gsseg_core.raster.view_operator import ViewOperator
 from gsseg_core.raster.view_renderer import NO_PIXELS, Blended, PixelGrid, Strongest
+from gsseg_core.raster.vote_total import VoteTotal
 from gsseg_core.scene.camera import Camera
 from gsseg_core.scene.gaussian_scene import GaussianScene
 from gsseg_core.spatial.row_order import take_rows
@@ -121,7 +122,7 @@ class TileOperator(ViewOperator):
         return label_weights(self.ids, self._tiles, Lifted.of(self._tiles, labels))
 
     def _vote(
-        self, labels: np.ndarray, evidence: LabelEvidence | None, total: np.ndarray, units: float, sign: int
+        self, labels: np.ndarray, evidence: LabelEvidence | None, total: VoteTotal, units: float, sign: int
     ) -> bool:
         lifted = Lifted.of(self._tiles, labels)
         evidence = evidence or LabelEvidence(lifted.classes)
@@ -136,7 +137,7 @@ def view_operator(scene: GaussianScene, camera: Camera, device: str) -> TileOper
     return TileOperator(camera, len(scene), projected.ids, assign(projected, camera.width, camera.height))
 
 
-def vote_total(votes: np.ndarray, device: str) -> AbstractContextManager[np.ndarray]:
+def vote_total(votes: VoteTotal, device: str) -> AbstractContextManager[VoteTotal]:
     """Give the votes themselves: observations add to them at once."""
     del device
     return nullcontext(votes)

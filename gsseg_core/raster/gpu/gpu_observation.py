@@ -134,7 +134,7 @@ class GPUObservation(Observation):
 
     def vote(self, total: Any, units: float, sign: int = 1) -> None:
         """Add the votes to those of other views, or take them away, where these are."""
-        if isinstance(total, np.ndarray):
+        if not isinstance(total, torch.Tensor):
             super().vote(total, units, sign)
             return
         label_votes = RowTensors.of(self.evidence.votes, total.device)

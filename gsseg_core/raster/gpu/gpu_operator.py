@@ -25,10 +25,12 @@ from gsseg_core.raster.objects_alone import ObjectsAlone
 from gsseg_core.raster.observation import Observation
 from gsseg_core.raster.view_operator import ViewOperator
 from gsseg_core.raster.view_renderer import NO_PIXELS, Blended, PixelGrid, Strongest
+from gsseg_core.raster.vote_total import VoteTotal
 from gsseg_core.scene.camera import Camera
 from gsseg_core.scene.gaussian_scene import GaussianScene
 
 FEW, MANY = 4, 32  # channels that are blended at once: colours or depths, and classes
+_COPIED = 1 << 24  # votes that are copied from the GPU at once
 
 
 class GPUOperator(ViewOperator):
@@ -188,17 +190,19 @@ def view_operator(scene: GaussianScene, camera: Camera, device: str) -> GPUOpera
 
 
 @contextmanager
-def vote_total(votes: np.ndarray, device: str) -> Iterator[Any]:
+def vote_total(votes: VoteTotal, device: str) -> Iterator[Any]:
     """Give a total on the GPU that is added to the votes at the end, or the votes themselves if that has no room."""
-    free = free_memory_on(device)
-    if free is not None and 4 * votes.nbytes > free:
+    (count, classes), free = votes.shape, free_memory_on(device)
+    if free is not None and 4 * 8 * count * classes > free:
         yield votes
         return
     total = torch.zeros(votes.shape, dtype=torch.int64, device=find_gpu(device))
     try:
         yield total
     finally:
-        votes += to_cpu(total)
+        at_once = max(_COPIED // classes, 1)
+        for first in range(0, count, at_once):
+            votes.add_rows(CSRRows.from_dense(to_cpu(total[first : first + at_once])), first)
 
 
 def free_memory_on(device: str) -> int | None:

@@ -236,7 +236,7 @@ def add_votes(
     indptr: np.ndarray, classes: np.ndarray, of_labels: np.ndarray,  # L rows: what a pixel of each label votes
     units: float, sign: int,
 ) -> None:  # fmt: skip
-    """Add the votes of one Gaussian to those of other views; see `raster.observation.add_votes`."""
+    """Add the votes of one Gaussian to those of other views; see `raster.vote_total`."""
     m = cuda.grid(1)
     if m < ids.shape[0]:
         for s in range(start[m], start[m + 1]):
