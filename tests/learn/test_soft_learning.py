@@ -33,7 +33,7 @@ from gsseg_core.learn.learner import VOTE_UNIT, Learner
 from gsseg_core.learn.mask_reliability import check_views
 from gsseg_core.learn.registry import LEARNERS, make_learner
 from gsseg_core.learn.vote_learner import VoteLearner
-from gsseg_core.learn.vote_resolution import impute_probabilities, resolved_votes
+from gsseg_core.learn.vote_resolution import impute_probabilities, is_resolved, resolved_votes, vote_shares, weigh_votes
 from gsseg_core.live.session import LiveSession
 from gsseg_core.raster.backends import make_operator
 
@@ -228,6 +228,41 @@ def test_what_stands_of_votes_is_what_a_slow_twin_keeps(rows: list[list[int]], i
             if len(free) == 1 and (row < 0).any():
                 expected[i, free[0]] = np.abs(row[row != 0]).min()
     np.testing.assert_array_equal(resolved_votes(CSRRows.from_dense(votes), possible).dense(5), expected)
+
+
+def normalised_votes(votes: np.ndarray, possible: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """The slow twin of `vote_shares`, before anything is imputed: shares (N, K), and which rows are left unsure."""
+    codes, unsure = np.zeros(votes.shape, np.float32), np.zeros(len(votes), bool)
+    for i, row in enumerate(votes):
+        positive, free = np.maximum(row, 0), np.flatnonzero((row == 0) & possible)
+        if positive.any():
+            codes[i] = positive / positive.sum()
+        elif row.any():
+            unsure[i] = len(free) != 1
+            codes[i, free] = len(free) == 1
+    return codes, unsure
+
+
+few_votes = st.lists(st.lists(st.integers(-2, 3), min_size=5, max_size=5), min_size=1, max_size=30)
+
+
+@given(few_votes, st.integers(0, 31), st.booleans())
+def test_shares_of_votes_are_those_of_a_slow_twin_to_the_last_bit(
+    drawn: list[list[int]], ids: int, mostly_against: bool
+) -> None:
+    possible = np.array([ids >> k & 1 for k in range(5)], bool)
+    votes = np.array(drawn, np.int64) * possible * 7
+    votes = np.minimum(votes, 0) if mostly_against else votes
+    rows = CSRRows.from_dense(votes)
+    expected, unsure = normalised_votes(votes, possible)
+    np.testing.assert_array_equal(is_resolved(rows, possible), expected.any(axis=1))
+    if unsure.any():
+        codes, where = CSRRows.from_dense(expected), np.flatnonzero(unsure)
+        expected = impute_probabilities(codes, rows, possible, where).dense(5)
+    np.testing.assert_array_equal(vote_shares(rows, possible).dense(5), expected)
+    total, least = weigh_votes(rows)
+    np.testing.assert_array_equal(total, np.abs(votes).sum(axis=1))
+    np.testing.assert_array_equal(least, votes.min(axis=1, initial=0))
 
 
 def test_where_several_classes_are_left_they_share_by_how_frequent_they_are() -> None:
