@@ -1,7 +1,9 @@
 """The votes of all views: of many classes, neighbours in space have votes for a few, and only those are kept.
 
-A *page* has the votes for one class of `PAGE` consecutive Gaussians. Since commands put the Gaussians of a scene in
-the order of a space-filling curve, these are neighbours, and most pages would hold nothing: there are none of those.
+A *page* has the votes for one class of `PAGE` Gaussians that follow each other. Commands put the Gaussians of a scene in
+the order of a space-filling curve, so these are neighbours, and most pages would hold nothing: there are none of those.
+Larger pages would be fuller of zeros, above all where Gaussians are in no such order, and smaller ones need a larger
+table of their numbers.
 """
 
 from __future__ import annotations
@@ -16,7 +18,7 @@ from gsseg_core.data.label_evidence import vote_units
 from gsseg_core.kernels.compiler import called_by_kernels, kernel
 from gsseg_core.simd import AHEAD, prefetch
 
-_BITS = 8
+_BITS = 5
 PAGE = 1 << _BITS  # Gaussians of a page
 _NONE, _WANTED = -1, -2  # in place of the number of a page: there is none; one is to be made
 

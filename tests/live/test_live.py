@@ -67,7 +67,7 @@ def test_classes_turn_up_with_their_labels_unless_they_were_declared() -> None:
 
 
 def test_a_label_that_would_take_too_much_memory_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(session_classes, "VOTES_LIMIT", 4 * 3 * 10)  # of a table of three blocks of Gaussians
+    monkeypatch.setattr(session_classes, "VOTES_LIMIT", 4 * 20 * 10)  # of a table of 20 blocks of Gaussians
     session = LiveSession(SCENE)
     assert session.fuse(blank(VIEWS[0], 9)) is None
     rejection = session.fuse(blank(VIEWS[1], 10))
@@ -80,7 +80,7 @@ def test_neither_a_dataset_nor_a_state_brings_more_classes_than_there_is_memory_
 ) -> None:
     fed(LiveSession(SCENE)).save(tmp_path / "state.npz")
     data = Dataset(write_dataset(tmp_path / "data"))
-    monkeypatch.setattr(session_classes, "VOTES_LIMIT", 4 * 3 * 3)
+    monkeypatch.setattr(session_classes, "VOTES_LIMIT", 4 * 20 * 3)
     session = LivingSession(SCENE)
     for take_in in (session.load, lambda path: session.merge([path])):
         with pytest.raises(StateFileError, match="holds 4 classes; expected at most 3 for a scene of 626 Gaussians"):
