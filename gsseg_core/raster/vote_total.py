@@ -1,9 +1,9 @@
 """The votes of all views: of many classes, neighbours in space have votes for a few, and only those are kept.
 
-A *page* has the votes for one class of `PAGE` Gaussians that follow each other. Commands put the Gaussians of a scene in
-the order of a space-filling curve, so these are neighbours, and most pages would hold nothing: there are none of those.
-Larger pages would be fuller of zeros, above all where Gaussians are in no such order, and smaller ones need a larger
-table of their numbers.
+A *page* has the votes for one class of `PAGE` Gaussians that follow each other. Commands put the Gaussians of a scene
+in the order of a space-filling curve, so these are neighbours, and most pages would hold nothing: there are none of
+those. Larger pages would have more zeros, above all where Gaussians are in no such order, and smaller ones need a
+larger table of their numbers.
 """
 
 from __future__ import annotations
