@@ -258,8 +258,11 @@ def test_shares_of_votes_are_those_of_a_slow_twin_to_the_last_bit(
     np.testing.assert_array_equal(is_resolved(rows, possible), expected.any(axis=1))
     if unsure.any():
         codes, where = CSRRows.from_dense(expected), np.flatnonzero(unsure)
-        expected = impute_probabilities(codes, rows, possible, where).dense(5)
-    np.testing.assert_array_equal(vote_shares(rows, possible).dense(5), expected)
+        with np.errstate(invalid="ignore"):  # Where nothing at all is possible.
+            expected = impute_probabilities(codes, rows, possible, where).dense(5)
+    with np.errstate(invalid="ignore"):
+        found = vote_shares(rows, possible).dense(5)
+    np.testing.assert_array_equal(found, expected)
     total, least = weigh_votes(rows)
     np.testing.assert_array_equal(total, np.abs(votes).sum(axis=1))
     np.testing.assert_array_equal(least, votes.min(axis=1, initial=0))
