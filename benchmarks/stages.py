@@ -138,7 +138,7 @@ def _refinement(path: Path, data: Dataset, runs: int) -> Times:
     fresh = [GaussianScene.load(path) for _ in range(runs)]
 
     def refine(scene: GaussianScene) -> Segmentation:
-        return Segmentation.refined(scene, rows, names, settings, evidence)
+        return Segmentation.unfiltered(scene, rows, names, settings, evidence)
 
     times["segment, first call"] = [once(lambda s=s: refine(s)) for s in fresh]
     del fresh

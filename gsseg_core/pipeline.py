@@ -153,7 +153,8 @@ def segment(
             names = inputs.class_names
             if settings.graph:
                 codes = CSRRows.from_dense(propagate(graph_of(inputs.scene), codes.dense(len(names)), evidence))
-            result = Segmentation.refined(inputs.scene, codes, names, settings.refine, evidence)
+            result = Segmentation.unfiltered(inputs.scene, codes, names, settings.refine, evidence)
+            result = result.filtered(inputs.scene, settings.refine)
             del codes
         drawn: dict[str, Drawn] = {}
         if settings.refine.carve:

@@ -133,23 +133,15 @@ class Segmentation:
         rows, names = CSRRows.from_dense(codes), {k: class_name(class_names, k) for k in columns}
         check_shares("codes", rows, SettingsError)
         check_evidence(px, SettingsError)
-        return cls.refined(scene, rows, names, settings, None if evidence is None else px)
-
-    @classmethod
-    def refined(
-        cls, scene: GaussianScene, codes: CSRRows, class_names: Mapping[int, str], settings: RefineSettings,
-        evidence: np.ndarray | None = None,
-    ) -> Segmentation:  # fmt: skip
-        """Do what `from_codes` does with codes that a learner has made, N rows, and names of all K classes."""
-        result = cls.unfiltered(scene, codes, class_names, settings, evidence)
-        return result.filtered(scene, settings) if settings.filter else result
+        result = cls.unfiltered(scene, rows, names, settings, None if evidence is None else px)
+        return result.filtered(scene, settings)
 
     @classmethod
     def unfiltered(
         cls, scene: GaussianScene, codes: CSRRows, class_names: Mapping[int, str], settings: RefineSettings,
         evidence: np.ndarray | None = None,
     ) -> Segmentation:  # fmt: skip
-        """Do what `refined` does, and leave the filter to the caller."""
+        """Do what `from_codes` does with a learner's codes and names of all K classes; the filter is left out."""
         refined, clustered = codes, np.zeros(len(scene), bool)
         if settings.cluster:
             px, neighbours = evidence if settings.weigh else None, neighbours_of(scene, settings.k)
@@ -167,8 +159,10 @@ class Segmentation:
             raise StateMismatchError(f"segmentation: belongs to the scene {found}; expected {given}, the one given")
 
     def filtered(self, scene: GaussianScene, settings: RefineSettings) -> Segmentation:
-        """Take the outliers out of each object: the paper's statistical filter; `StateMismatchError` as in `carved`."""
+        """Take the outliers out of each object, if asked for: the paper's statistical filter. Raises as `carved`."""
         self.require(scene)
+        if not settings.filter:
+            return self
         neighbours, classes = neighbours_of(scene, settings.k), len(self.class_names)
         out = statistical_filter(scene.means, self.labels, settings.k, settings.filter_sigmas, classes, neighbours)
         return self._without(out)

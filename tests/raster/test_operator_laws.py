@@ -7,7 +7,7 @@ import itertools
 import numba
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import example, given, settings
 from hypothesis import strategies as st
 from naive_rasteriser import naive_view
 from operator_backends import CPU
@@ -223,6 +223,7 @@ def test_a_mask_of_which_nothing_is_known_is_lifted_to_nothing(backend):
 
 @few
 @given(views, st.integers(0, 45), st.integers(1, 20), st.integers(0, 6))
+@example({"seed": 0, "n": 3, "width": 1, "height": 1}, 0, 2, 0)
 def test_the_pixels_of_a_grid_are_blended_as_in_the_whole_image_to_the_last_bit(backend, view, first, step, channels):
     scene, camera = random_view(**view)
     operator, grid = backend.make(scene, camera), PixelGrid(first, step)

@@ -165,7 +165,10 @@ def _taken(build: Builder, power: Any, lifts: bool) -> Any:
     hit = llvm.and_(
         llvm.fcmp_ordered(">=", power, constant(LOG_ALPHA_MIN)), llvm.fcmp_ordered(">=", before, constant(T_MIN))
     )
-    weight = llvm.select(hit, llvm.fmul(_alpha(build, power), before), constant(0.0))
+    # The flag keeps those off it by which a caller would fuse product and difference: where weights are not asked for,
+    # rays would end a bit apart.
+    taken = llvm.fmul(_alpha(build, power), before, flags=("nsz",))
+    weight = llvm.select(hit, taken, constant(0.0))
     after = llvm.fsub(before, weight)
     goes_on = llvm.fcmp_ordered(">=", after, constant(T_LIFTED if lifts else T_MIN))
     if lifts:  # A ray that has ended has nothing left, so it stays as it is.
