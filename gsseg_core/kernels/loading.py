@@ -8,6 +8,7 @@ loaded is its machine code; its bitcode is read when another that calls it is co
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any
 
 import llvmlite.binding as llvm
@@ -19,6 +20,7 @@ from numba.core.runtime.nrt import rtsys
 from numba.np.ufunc.parallel import _launch_threads
 
 from gsseg_core.kernels.parts import taken_for
+from gsseg_core.kernels.stamps import stamp_of
 
 
 class _Loaded(JITCodeLibrary):
@@ -96,6 +98,10 @@ def _environment(name: str, module: str, constants: list[object]) -> Environment
 
 class _KernelCache(FunctionCache):
     _impl_class = _FileOfKernel
+
+    def __init__(self, function: Callable[..., Any]) -> None:
+        super().__init__(function)
+        self._cache_file._source_stamp = stamp_of(function)
 
     def load_overload(self, sig: Any, target_context: Any) -> Any:
         rtsys.initialize(target_context)  # All that machine code needs of what numba makes ready to compile.

@@ -1,0 +1,58 @@
+"""Kernels in the cache are those of the code as it is, also of what they call in other files."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+FILES = {
+    "__init__": "",
+    "kernels": "from gsseg_core.kernels.compiler import kernel\nfrom made.calls import (\n    Pair,\n    called,\n)\n"
+    "from made.readers import FACTOR, read\n\n@kernel\ndef double(x):\n    return called(Pair(x, 2 * x)) * FACTOR\n",
+    "calls": "from collections import namedtuple\nfrom gsseg_core.kernels.compiler import called_by_kernels\n"
+    "from made import deep\n\nPair = namedtuple('Pair', ['one', 'other'])\n\n"
+    "@called_by_kernels\ndef called(x):\n    return deep.deeper(x.one)\n",
+    "deep": "import numba\n\n@numba.njit\ndef deeper(x):\n    return x + 1\n",
+    "readers": "from made import formats\nFACTOR = 2\n\ndef read(file):\n    return formats.known(file)\n",
+    "formats": "def known(file):\n    return True\n",
+}
+CALL = "from made.kernels import double; print(double(3), sum(double.stats.cache_hits.values()))"
+
+
+@pytest.fixture
+def package(tmp_path: Path) -> Path:
+    """Write a package with a kernel, and have it compiled."""
+    (tmp_path / "made").mkdir()
+    for name, content in FILES.items():
+        (tmp_path / "made" / f"{name}.py").write_text(content)
+    assert called_from(tmp_path) == "8 0" and called_from(tmp_path) == "8 1"
+    return tmp_path
+
+
+def called_from(folder: Path) -> str:
+    """Call the kernel in a program of its own: what it returns, and how many kernels came from the cache."""
+    program = f"import sys; sys.path.insert(0, {str(folder)!r}); sys.dont_write_bytecode = True; {CALL}"
+    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True)
+    return done.stdout.strip()
+
+
+@pytest.mark.parametrize(
+    ("file", "before", "after", "expected"),
+    [
+        ("deep", "x + 1", "x + 7", "20 0"),
+        ("calls", "deeper(x.one)", "deeper(x.other)", "14 0"),
+        ("calls", "['one', 'other']", "['other', 'one']", "14 0"),
+        ("readers", "FACTOR = 2", "FACTOR = 3", "12 0"),
+        ("readers", "formats.known(file)", "not formats.known(file)", "8 1"),
+        ("formats", "True", "False", "8 1"),
+    ],
+)
+def test_a_kernel_is_compiled_anew_where_what_it_was_made_of_has_changed_and_nowhere_else(
+    package: Path, file: str, before: str, after: str, expected: str
+) -> None:
+    path = package / "made" / f"{file}.py"
+    path.write_text(path.read_text().replace(before, after))
+    assert called_from(package) == expected
