@@ -19,7 +19,7 @@ from typing import NamedTuple
 import numba as nb
 import numpy as np
 
-from gsseg_core.csr_rows import CSRRows
+from gsseg_core.csr_rows import CSRRows, slices
 from gsseg_core.kernels.compiler import kernel
 from gsseg_core.scene.gaussian_scene import GaussianScene
 from gsseg_core.scene.scene_cache import PerScene
@@ -28,7 +28,6 @@ from gsseg_core.spatial import knn
 from gsseg_core.spatial.kd_tree import LEAF, Tree, leaf_range, scaled, tree_of
 
 CODE_UNIT = 2.0**-24  # codes are summed in steps of this, which is the precision of a float32 near 1
-ROWS_AT_ONCE = 1 << 16  # points whose mean codes are written out at once
 
 HALF = 3.0
 """Evidence in px with which a Gaussian has half of the weight in its neighbours' means that it could have at most."""
@@ -94,10 +93,9 @@ class Neighbours:
         means_of, parts = self._prepared(codes, weights, selected), [CSRRows.empty(0)]
         # A block at a time is written out in full, so that of all the codes only what is not zero is ever in memory.
         asked = np.flatnonzero(selected).astype(np.int32)
-        for first in range(0, len(asked), ROWS_AT_ONCE):
-            places = asked[first : first + ROWS_AT_ONCE]
-            out = np.zeros((len(places), num_classes), np.float32)
-            means_of(places, out)
+        for some in slices(len(asked), num_classes):
+            out = np.zeros((some.stop - some.start, num_classes), np.float32)
+            means_of(asked[some], out)
             parts.append(CSRRows.from_dense(out))
         rows = np.full(len(order), -1)
         rows[order[asked]] = np.arange(len(asked))

@@ -102,7 +102,7 @@ CASES = [
     Case("segment", "UNKNOWN_CLASS", "main", "class 'sofa' does not exist; expected one of", {"classes": ["sofa"]}),
     Case("segment", "INVALID_VIEWPOINT", "main", "expected zeros: what is", nowhere(d=[0.1, 0.0, 0.0, 0.0, 0.0])),
     Case("segment", "NO_TRANSFORM", "main", "frame_id is 'odom'", nowhere("odom")),
-    Case("segment", "UNKNOWN", "starved", "unexpected MemoryError"),
+    Case("segment", "UNKNOWN", "exhausted", "unexpected MemoryError"),
     Case("pick", "NOT_ACTIVE", "idle", "the node is not active"),
     Case("pick", "BUSY", "crowded", "too many requests"),
     Case("pick", "INVALID_REQUEST", "main", "expected a mask, or points inside", nowhere()),
@@ -119,7 +119,7 @@ CASES = [
     Case("render_view", "NO_CODES", "fresh", "expected at least one posed mask"),
     Case("render_view", "INVALID_VIEWPOINT", "main", "viewpoint_", {}),
     Case("render_view", "NO_TRANSFORM", "main", "frame_id is 'odom'", nowhere("odom")),
-    Case("render_view", "UNKNOWN", "starved", "unexpected MemoryError", nowhere()),
+    Case("render_view", "UNKNOWN", "exhausted", "unexpected MemoryError", nowhere()),
     Case("load_scene", "NOT_ACTIVE", "idle", "the node is not active"),
     Case("load_scene", "BUSY", "busy", "learn is running"),
     Case("load_scene", "INVALID_REQUEST", "bare", "path and the parameter scene_path are both empty"),
@@ -134,7 +134,7 @@ CASES = [
     Case("save_state", "PATH_NOT_ALLOWED", "main", NOT_BELOW, {"path": "../state.npz"}),
     Case("save_state", "WRITE_FAILED", "main", "other.ply: cannot be written", {"path": "other.ply/below.npz"}),
     Case("save_state", "PATH_TAKEN", "main", "scene.ply: is there and is no saved state", {"path": "data/scene.ply"}),
-    Case("save_state", "UNKNOWN", "starved", "unexpected MemoryError"),
+    Case("save_state", "UNKNOWN", "exhausted", "unexpected MemoryError"),
     Case("load_state", "NOT_ACTIVE", "idle", "the node is not active"),
     Case("load_state", "BUSY", "busy", "learn is running", {"path": "other_state.npz"}),
     Case("load_state", "NO_SCENE", "bare", "no scene is loaded"),
@@ -152,7 +152,7 @@ CASES = [
     Case("export", "PATH_NOT_ALLOWED", "main", NOT_BELOW, {"directory": "../out"}),
     Case("export", "WRITE_FAILED", "main", "below: cannot be written", {"directory": "other.ply/below"}),
     Case("export", "PATH_TAKEN", "main", "data: holds 'cameras.json', and no results", {"directory": "data"}),
-    Case("export", "UNKNOWN", "starved", "unexpected MemoryError"),
+    Case("export", "UNKNOWN", "exhausted", "unexpected MemoryError"),
     Case("reset", "NOT_ACTIVE", "idle", "the node is not active"),
     Case("reset", "BUSY", "busy", "learn is running"),
     Case("reset", "UNKNOWN", "starved", "unexpected MemoryError"),
@@ -214,12 +214,12 @@ MORE_CASES = [
 
 @pytest.fixture(scope="module")
 def starved(shared: Ros, root: Path) -> Robot:
-    """A node with so many Gaussians and classes that the votes take 300 MB, and class probabilities half of that."""
+    """A node with so many Gaussians and classes that even a session without any votes takes 190 MB."""
     rng = np.random.default_rng(0)
-    scene = build(np.zeros(250_000, np.int64), rng.uniform(-1, 1, (250_000, 3)), np.full((250_000, 3), 0.004))
+    scene = build(np.zeros(1_000_000, np.int64), rng.uniform(-1, 1, (1_000_000, 3)), np.full((1_000_000, 3), 0.004))
     scene.save(root / "large.ply")
     core_session(scene, clean_views(1)).save(root / "narrow_state.npz")
-    names = [*CLASSES, *(f"class {k}" for k in range(len(CLASSES), 150))]
+    names = [*CLASSES, *(f"class {k}" for k in range(len(CLASSES), 1500))]
     robot = Robot(shared, "/starved")
     robot.started({"scene_path": root / "large.ply", "data_root": root, "class_names": names})
     robot.drive(clean_views(1))
@@ -229,7 +229,7 @@ def starved(shared: Ros, root: Path) -> Robot:
 
 @contextmanager
 def short_of_memory(robot: Robot) -> Iterator[None]:
-    """Leave the node too little memory for another set of votes, or for class probabilities."""
+    """Leave the node too little memory for another session or learner."""
     assert robot.process is not None
     pages = int(Path(f"/proc/{robot.process.pid}/statm").read_text().split()[0])
     with limited(robot, resource.RLIMIT_AS, pages * resource.getpagesize() + (90 << 20)):
@@ -253,28 +253,48 @@ def answer(robot: Robot, case: Case) -> Any:
     return result
 
 
-@pytest.fixture(scope="module")
-def crowded(shared: Ros, parameters: dict[str, Any]) -> Iterator[Robot]:
-    """A node, in this process, that has as many requests as it takes, and does not come to their end."""
-    robot, go_on, draw = Robot(shared, "/crowded"), threading.Event(), services.draw
+@contextmanager
+def in_this_process(robot: Robot, parameters: dict[str, Any]) -> Iterator[SegmentNode]:
+    """Run a node in this process, active and with one view."""
     values = {name: str(value) if isinstance(value, Path) else value for name, value in parameters.items()}
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(segment_node, "warm_up", lambda *_: None)
-        patch.setattr(services, "draw", lambda *a, **k: (go_on.wait(PATIENCE), draw(*a, **k))[1])
         node = SegmentNode(
-            context=shared.context, namespace="/crowded", use_global_arguments=False,
+            context=robot.ros.context, namespace=robot.namespace, use_global_arguments=False,
             parameter_overrides=[Parameter(name, value=value) for name, value in values.items()],
         )  # fmt: skip
         with spun(node):
             assert robot.brought_to("inactive").change("activate")
             robot.fuse(clean_views(1))
-            requests = [robot.send("render_view", **nowhere()) for _ in range(AT_WORK + WAITING + 1)]
-            shared.wait_until(lambda: any(request.done() for request in requests), "a request that is refused")
-            yield robot
-            go_on.set()
-            codes = sorted(shared.result(request).error_code for request in requests)
-            assert codes == [0] * (AT_WORK + WAITING) + [SERVICES["render_view"].Response.BUSY]
+            yield node
         node.close()
+
+
+@pytest.fixture(scope="module")
+def crowded(shared: Ros, parameters: dict[str, Any]) -> Iterator[Robot]:
+    """A node that has as many requests as it takes, and does not come to their end."""
+    robot, go_on, draw = Robot(shared, "/crowded"), threading.Event(), services.draw
+    with pytest.MonkeyPatch.context() as patch, in_this_process(robot, parameters):
+        patch.setattr(services, "draw", lambda *a, **k: (go_on.wait(PATIENCE), draw(*a, **k))[1])
+        requests = [robot.send("render_view", **nowhere()) for _ in range(AT_WORK + WAITING + 1)]
+        shared.wait_until(lambda: any(request.done() for request in requests), "a request that is refused")
+        yield robot
+        go_on.set()
+        codes = sorted(shared.result(request).error_code for request in requests)
+        assert codes == [0] * (AT_WORK + WAITING) + [SERVICES["render_view"].Response.BUSY]
+
+
+@pytest.fixture(scope="module")
+def exhausted(shared: Ros, parameters: dict[str, Any]) -> Iterator[Robot]:
+    """A node whose session has no memory left, neither to segment nor to save."""
+
+    def without_memory(*_: object, **__: object) -> None:
+        raise MemoryError
+
+    robot = Robot(shared, "/exhausted")
+    with in_this_process(robot, parameters) as node:
+        node.workspace.session.segmentation = node.workspace.session.save = without_memory
+        yield robot
 
 
 def provoke(case: Case, nodes: Nodes, request: pytest.FixtureRequest) -> Any:
@@ -285,8 +305,8 @@ def provoke(case: Case, nodes: Nodes, request: pytest.FixtureRequest) -> Any:
     if case.on == "busy":
         with busy(nodes.main):
             return answer(nodes.main, case)
-    if case.on == "crowded":
-        return answer(request.getfixturevalue("crowded"), case)
+    if case.on in ("crowded", "exhausted"):
+        return answer(request.getfixturevalue(case.on), case)
     if case.on == "starved":
         robot = request.getfixturevalue("starved")
         with short_of_memory(robot):
@@ -333,7 +353,8 @@ def test_a_path_with_a_nul_is_refused(root: Path) -> None:
 
 def test_after_memory_ran_out_the_node_goes_on(starved: Robot) -> None:
     with short_of_memory(starved):
-        assert starved.ask("segment").error_code == SERVICES["segment"].Response.UNKNOWN
+        response = starved.ask("load_state", path="narrow_state.npz")
+        assert response.error_code == SERVICES["load_state"].Response.UNKNOWN
     assert starved.done("segment", skip_refinement=True).report.num_views == 1
     starved.process.wait_for("Traceback")  # The log has the details.
     assert starved.done("reset").num_views_dropped == 1
