@@ -63,10 +63,14 @@ def _read(module: str, root: Path) -> tuple[bytes, list[str]]:
     return content, sorted(imported)
 
 
-def _numbers(module: ModuleType | None) -> list[tuple[str, str]]:
-    """List the numbers in a module, and the fields of its tuples, by name."""
-    return sorted(
-        (name, repr(getattr(value, "_fields", value)))
-        for name, value in vars(module or object).items()
-        if isinstance(value, int | float | np.number) or hasattr(value, "_fields")
-    )
+def _numbers(module: ModuleType | None) -> list[tuple[str, str, str]]:
+    """List the numbers in a module with their types, and the fields of its tuples, by name."""
+    found = []
+    for name, value in vars(module or object).items():
+        if isinstance(value, int | float | np.number):
+            # As Python writes it: NumPy writes its numbers otherwise from version to version.
+            plain = value.item() if isinstance(value, np.number) else value
+            found.append((name, type(value).__name__, repr(plain)))
+        elif hasattr(value, "_fields"):
+            found.append((name, "fields", repr(value._fields)))
+    return sorted(found)
