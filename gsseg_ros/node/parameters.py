@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import re
+from collections import Counter
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, fields
 from pathlib import Path
@@ -129,7 +130,7 @@ class Settings:
         for index, flaw in enumerate(map(flaw_of_class_name, self.class_names)):
             if flaw:
                 raise SettingsError(f"parameter class_names: label {index} has the name {flaw}")
-        twice = sorted({name for name in self.class_names if self.class_names.count(name) > 1})
+        twice = sorted(name for name, count in Counter(self.class_names).items() if count > 1)
         if twice:
             raise SettingsError(f"parameter class_names: {twice[0]!r} occurs more than once; expected distinct names")
         if self.obstacle_min_height > self.obstacle_max_height:
@@ -184,6 +185,8 @@ def check(
 ) -> SetParametersResult:
     """Decide whether a node's parameters may change, and say why not; rclpy itself refuses those of the start."""
     known = {declaration.name for declaration in DECLARATIONS}
+    if known.isdisjoint(parameter.name for parameter in changed):  # Those of ROS itself, as of qualities of service.
+        return SetParametersResult(successful=True)
     for parameter in changed:
         if configured and parameter.name in known - AT_ONCE:
             reason = (

@@ -19,6 +19,7 @@ from rcl_interfaces.msg import ParameterType
 from rclpy.parameter import Parameter, get_parameter_value
 
 from gsseg_ros.node.declarations import AT_ONCE, DECLARATIONS
+from gsseg_ros.node.parameters import Settings, check
 
 
 def test_every_parameter_is_typed_described_and_ranged(robot: Robot) -> None:
@@ -243,3 +244,12 @@ def test_parameters_come_from_a_file(ros: Ros, parameters: dict[str, Any], tmp_p
     found = {name: robot.get(name) for name in wanted}
     assert {name: list(v) if isinstance(wanted[name], list) else v for name, v in found.items()} == wanted
     robot.wait_for_status(lambda status: status.get("classes") == "5", "five classes")
+
+
+def test_parameters_of_ros_itself_may_change_without_a_look_at_those_of_the_node(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """A node declares dozens of them, and its own may have thousands of class names."""
+    monkeypatch.setattr(Settings, "read", lambda *_: pytest.fail("settings were read"))
+    changed = [Parameter("qos_overrides./mask.subscription.depth", value=3)]
+    assert check(None, changed, True, lambda _: None).successful
