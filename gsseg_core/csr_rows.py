@@ -27,10 +27,9 @@ class CSRRows(NamedTuple):
     def from_dense(cls, array: np.ndarray) -> CSRRows:  # (N, K)
         """Keep the entries that are not zero."""
         array = np.ascontiguousarray(array)
-        indptr = np.zeros(len(array) + 1, np.int64)
-        _count(array, indptr[1:])
-        np.cumsum(indptr, out=indptr)
-        rows = cls(indptr, np.empty(indptr[-1], np.uint32), np.empty(indptr[-1], array.dtype))
+        counts = np.empty(len(array), np.int64)
+        _count(array, counts)
+        rows = cls.room_for(counts, array.dtype)
         _fill(array, rows)
         return rows
 
@@ -38,6 +37,12 @@ class CSRRows(NamedTuple):
     def empty(cls, num_rows: int, dtype: npt.DTypeLike = np.float32) -> CSRRows:
         """Make rows without entries."""
         return cls(np.zeros(num_rows + 1, np.int64), np.empty(0, np.uint32), np.empty(0, dtype))
+
+    @classmethod
+    def room_for(cls, counts: np.ndarray, dtype: npt.DTypeLike) -> CSRRows:  # (N,)
+        """Make rows of so many entries each, with nothing written into them."""
+        indptr = starts(counts)
+        return cls(indptr, np.empty(indptr[-1], np.uint32), np.empty(indptr[-1], dtype))
 
     @classmethod
     def vstack(cls, parts: Sequence[CSRRows]) -> CSRRows:  # at least one
@@ -71,11 +76,10 @@ class CSRRows(NamedTuple):
 
     def united(self, other: CSRRows) -> tuple[CSRRows, CSRRows]:
         """Give two arrays the union of their patterns, filled up with explicit zeros."""
-        indptr = np.zeros_like(self.indptr)
-        _count_united(self, other, indptr[1:])
-        np.cumsum(indptr, out=indptr)
-        united = CSRRows(indptr, np.empty(indptr[-1], np.uint32), np.empty(indptr[-1], self.data.dtype))
-        united_other = united.with_data(np.empty(indptr[-1], other.data.dtype))
+        counts = np.empty(self.num_rows, np.int64)
+        _count_united(self, other, counts)
+        united = CSRRows.room_for(counts, self.data.dtype)
+        united_other = united.with_data(np.empty(len(united.data), other.data.dtype))
         _unite(self, other, united, united_other.data)
         return united, united_other
 
@@ -94,6 +98,10 @@ class CSRRows(NamedTuple):
         ends = starts(self.data)[self.indptr]
         return np.asarray(ends[1:] - ends[:-1])
 
+    def known(self) -> np.ndarray:
+        """Tell which rows of float32 have an entry above zero, (N,) bool."""
+        return np.asarray(largest(self)[0] > 0)
+
     def nonzero(self) -> CSRRows:
         """Drop entries that have become zero."""
         kept = self.data != 0
@@ -101,8 +109,7 @@ class CSRRows(NamedTuple):
 
     def take(self, ids: np.ndarray) -> CSRRows:  # (M,)
         """Copy some rows: M of them."""
-        indptr = starts((self.indptr[1:] - self.indptr[:-1])[ids])
-        rows = CSRRows(indptr, np.empty(indptr[-1], np.uint32), np.empty(indptr[-1], self.data.dtype))
+        rows = CSRRows.room_for(np.diff(self.indptr)[ids], self.data.dtype)
         _take(self, ids, rows)
         return rows
 
@@ -111,8 +118,7 @@ class CSRRows(NamedTuple):
         lengths = np.diff(self.indptr)
         taken = np.flatnonzero(rows >= 0)
         lengths[taken] = np.diff(others.indptr)[rows[taken]]
-        indptr = starts(lengths)
-        made = CSRRows(indptr, np.empty(indptr[-1], np.uint32), np.empty(indptr[-1], self.data.dtype))
+        made = CSRRows.room_for(lengths, self.data.dtype)
         _copy_rows(self, rows, others, made)
         return made
 
@@ -125,8 +131,7 @@ class CSRRows(NamedTuple):
         moved = CSRRows(self.indptr, columns.astype(np.uint32), self.data.copy())
         lengths = np.empty(self.num_rows, np.int64)
         _sort_and_add(moved, lengths)
-        indptr = starts(lengths)
-        made = CSRRows(indptr, np.empty(indptr[-1], np.uint32), np.empty(indptr[-1], self.data.dtype))
+        made = CSRRows.room_for(lengths, self.data.dtype)
         _take(moved, np.arange(self.num_rows), made)
         return made
 

@@ -99,7 +99,7 @@ class NpzArrays:
             (num_rows, num_columns), by_column, found = _HEADERS[version](member)
             if by_column:
                 return CSRRows.from_dense(self.read(name))
-            parts = [CSRRows.from_dense(np.empty((0, num_columns), dtype))]
+            parts = [CSRRows.empty(0, dtype)]
             for some in slices(num_rows, num_columns):
                 size = (some.stop - some.start) * num_columns
                 content = member.read(size * found.itemsize)

@@ -11,7 +11,7 @@ from typing import Any, TypeVar
 
 import numpy as np
 
-from gsseg_core.csr_rows import CSRRows, largest
+from gsseg_core.csr_rows import CSRRows
 from gsseg_core.data.soft_masks import SeenLabels
 from gsseg_core.data.view import View
 from gsseg_core.errors import NoUsableViewsError, SettingsError, StateMismatchError, UnknownLabelError
@@ -398,7 +398,7 @@ class Learner(ABC):
         codes = self.code_rows_.only(~(unsure & ~against))
         if (unsure & against).any():
             codes = impute_probabilities(codes, votes, self._possible(), np.flatnonzero(unsure & against))
-            self.observed_[unsure] = largest(codes)[0][unsure] > 0
+            self.observed_[unsure] = codes.known()[unsure]
         self.code_rows_ = codes
 
     def _blend_codes(self, codes: CSRRows, view: View) -> np.ndarray:

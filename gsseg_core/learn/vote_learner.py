@@ -6,7 +6,6 @@ from dataclasses import replace
 
 import numpy as np
 
-from gsseg_core.csr_rows import largest
 from gsseg_core.data.view import View
 from gsseg_core.learn.learner import Learner, Progress, silent
 from gsseg_core.scene.camera import Camera
@@ -24,7 +23,7 @@ class VoteLearner(Learner):
         """Normalise the votes."""
         self._require_views()
         self.code_rows_, self.converged_ = self.vote_rows(), True
-        self.observed_ = largest(self.code_rows_)[0] > 0
+        self.observed_ = self.code_rows_.known()
         return self
 
     def move(self, name: str, camera: Camera) -> None:

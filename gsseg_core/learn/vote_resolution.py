@@ -8,7 +8,7 @@ from __future__ import annotations
 import numba as nb
 import numpy as np
 
-from gsseg_core.csr_rows import CSRRows, starts
+from gsseg_core.csr_rows import CSRRows
 from gsseg_core.kernels.compiler import called_by_kernels, kernel
 
 ROUNDS = 50  # of estimating how frequent classes are
@@ -37,8 +37,7 @@ def vote_shares(votes: CSRRows, possible: np.ndarray) -> CSRRows:  # int64; (K,)
     they share as `impute_probabilities` says.
     """
     counts, only = _count_shares(votes, possible)
-    indptr = starts(counts)
-    shares = CSRRows(indptr, np.empty(indptr[-1], np.uint32), np.empty(indptr[-1], np.float32))
+    shares = CSRRows.room_for(counts, np.float32)
     _share(votes, only, shares)
     unsure = np.flatnonzero(only == _UNSURE)
     return impute_probabilities(shares, votes, possible, unsure) if len(unsure) else shares

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from gsseg_core.csr_rows import CSRRows, largest
+from gsseg_core.csr_rows import CSRRows
 from gsseg_core.learn.learner import Learner
 from gsseg_core.learn.learner_state import Learnt
 from gsseg_core.progress import Stopwatch
@@ -46,11 +46,7 @@ def current_codes(votes: Learner, learnt: Learnt | None) -> CSRRows:
     codes = votes.vote_rows()
     if learnt is None:
         return codes
-    return codes.replaced(np.where(_known(learnt), np.arange(codes.num_rows), -1), learnt.codes)
-
-
-def _known(learnt: Learnt) -> np.ndarray:  # (N,) bool
-    return np.asarray(largest(learnt.codes)[0] > 0)
+    return codes.replaced(np.where(learnt.codes.known(), np.arange(codes.num_rows), -1), learnt.codes)
 
 
 def current_evidence(votes: Learner, learnt: Learnt | None) -> np.ndarray | None:
@@ -58,4 +54,4 @@ def current_evidence(votes: Learner, learnt: Learnt | None) -> np.ndarray | None
     evidence = votes.evidence()
     if learnt is None:
         return evidence
-    return None if learnt.evidence is None else np.where(_known(learnt), learnt.evidence, evidence)
+    return None if learnt.evidence is None else np.where(learnt.codes.known(), learnt.evidence, evidence)

@@ -11,6 +11,7 @@ from typing import Any
 
 import numpy as np
 
+from gsseg_core.csr_rows import CSRRows
 from gsseg_core.data.dataset import Dataset
 from gsseg_core.data.view import View
 from gsseg_core.errors import GssegError, SettingsError
@@ -175,14 +176,16 @@ class PerViewSession(LiveSession):
 
 
 def _with_numbers(state: State, successors: np.ndarray) -> State:  # (K',)
-    """Add up votes for classes that get the same number."""
-    numbers = np.arange(state.num_classes)
-    numbers[: len(successors)] = successors[: len(numbers)]
-    votes = state.votes.in_columns(numbers[state.votes.indices]).nonzero()
+    votes = _added_up(state.votes, successors).nonzero()
     return replace(state, votes=votes, num_classes=max(state.num_classes, int(successors.max()) + 1))
 
 
 def _renumbered(learnt: Learnt, successors: np.ndarray) -> Learnt:
-    codes, table = learnt.codes, np.arange(int(learnt.codes.indices.max(initial=0)) + 1)
-    table[: len(successors)] = successors[: len(table)]
-    return replace(learnt, codes=codes.in_columns(table[codes.indices]))
+    return replace(learnt, codes=_added_up(learnt.codes, successors))
+
+
+def _added_up(rows: CSRRows, successors: np.ndarray) -> CSRRows:  # (K',)
+    """Add up columns that get the same number; those from K' on keep theirs."""
+    table = np.arange(max(int(rows.indices.max(initial=0)) + 1, len(successors)))
+    table[: len(successors)] = successors
+    return rows.in_columns(table[rows.indices])

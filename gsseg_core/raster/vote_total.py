@@ -77,10 +77,9 @@ class VoteTotal:
 
     def rows(self) -> CSRRows:
         """Return the votes that are not zero."""
-        indptr = np.zeros(self._num_gaussians + 1, np.int64)
-        _count(self._table, self._pages, indptr[1:])
-        np.cumsum(indptr, out=indptr)
-        rows = CSRRows(indptr, np.empty(indptr[-1], np.uint32), np.empty(indptr[-1], np.int64))
+        counts = np.zeros(self._num_gaussians, np.int64)
+        _count(self._table, self._pages, counts)
+        rows = CSRRows.room_for(counts, np.int64)
         _fill(self._table, self._pages, rows)
         return rows
 

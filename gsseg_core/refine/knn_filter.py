@@ -62,7 +62,7 @@ def before_clustering(
 ) -> CSRRows:
     """Give the codes that Gaussians have learnt themselves, and of those that learnt nothing what they are."""
     rows = np.full(len(clustered), -1)
-    rows[clustered] = np.where(largest(learnt)[0] > 0, np.arange(learnt.num_rows), -1)
+    rows[clustered] = np.where(learnt.known(), np.arange(learnt.num_rows), -1)
     return codes.replaced(rows, learnt)
 
 

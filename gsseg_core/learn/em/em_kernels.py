@@ -15,7 +15,7 @@ import numpy as np
 from llvmlite import ir
 from numba.core import types
 
-from gsseg_core.csr_rows import CSRRows, starts
+from gsseg_core.csr_rows import CSRRows
 from gsseg_core.kernels.compiler import kernel
 from gsseg_core.raster.observation import Observation, ViewPairs
 from gsseg_core.simd import intrinsic
@@ -48,8 +48,7 @@ def by_row(pairs: ViewPairs) -> ViewPairs:
 
 def rows_like(rows: CSRRows, ids: np.ndarray) -> CSRRows:  # (M,)
     """Make M rows as long as those of `ids`, with nothing written into them."""
-    indptr = starts(np.diff(rows.indptr)[ids])
-    return CSRRows(indptr, np.empty(indptr[-1], np.uint32), np.empty(indptr[-1], rows.data.dtype))
+    return CSRRows.room_for(np.diff(rows.indptr)[ids], rows.data.dtype)
 
 
 @intrinsic
