@@ -102,6 +102,10 @@ class CSRRows(NamedTuple):
         """Tell which rows of float32 have an entry above zero, (N,) bool."""
         return np.asarray(largest(self)[0] > 0)
 
+    def has_column(self, column: int) -> bool:
+        """Tell whether any row has an entry there."""
+        return bool((self.indices == column).any())
+
     def nonzero(self) -> CSRRows:
         """Drop entries that have become zero."""
         kept = self.data != 0

@@ -24,10 +24,11 @@ from gsseg_core.files.json_files import write_json
 from gsseg_core.files.run_folder import staged_run
 from gsseg_core.files.write_behind import writing_behind
 from gsseg_core.learn.calibrate import calibrate
-from gsseg_core.learn.learner import NO_MASK, SEES_NOTHING, Learner
+from gsseg_core.learn.learner import Learner
 from gsseg_core.learn.mask_reliability import MaskChecker, reliability_report, shown_views
 from gsseg_core.learn.prepared_views import default_budget
 from gsseg_core.learn.registry import make_learner
+from gsseg_core.learn.usable_views import NO_MASK, SEES_NOTHING
 from gsseg_core.objects.object_table import find_objects
 from gsseg_core.progress import Progress, Stopwatch, silent, with_progress
 from gsseg_core.refine.label_propagation import UNKNOWN_SHARE, GraphSettings, propagate

@@ -343,7 +343,7 @@ class Segmentation:
     @cached_property
     def _blended(self) -> tuple[CSRRows, bool]:
         codes = before_clustering(tempered_rows(self.shares, 1 / self.temperature), self.clustered, self.learnt)
-        return codes, bool((codes.indices == 0).any())
+        return codes, codes.has_column(0)
 
     def save(self, path: str | os.PathLike[str], run: str | None = None) -> None:
         """Write labels, probabilities, confidence, class ids and names as one npz, atomically; ids and tree, if any.

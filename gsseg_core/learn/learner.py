@@ -14,10 +14,11 @@ import numpy as np
 from gsseg_core.csr_rows import CSRRows
 from gsseg_core.data.soft_masks import SeenLabels
 from gsseg_core.data.view import View
-from gsseg_core.errors import NoUsableViewsError, SettingsError, StateMismatchError, UnknownLabelError
+from gsseg_core.errors import NoUsableViewsError, SettingsError, StateMismatchError
 from gsseg_core.files.limits import MAX_LABEL
 from gsseg_core.learn.learner_state import State
 from gsseg_core.learn.prepared_views import PreparedViews, default_budget
+from gsseg_core.learn.usable_views import SEES_NOTHING, UnusableViewError, read_mask, read_usable_mask
 from gsseg_core.learn.vote_resolution import impute_probabilities, vote_shares, weigh_votes
 from gsseg_core.learn.whole_rays import votes_cast_anew
 from gsseg_core.progress import Progress as Progress
@@ -35,16 +36,10 @@ from gsseg_core.text import counted
 VOTE_UNIT = 2.0**-24  # votes are counted in whole multiples of this many px, so that adding and taking back are exact
 UNITS = 1 / VOTE_UNIT  # units per px
 
-NO_MASK, SEES_NOTHING, ALL_UNKNOWN = "no mask", "sees no Gaussian", "all pixels unknown"
-
 Self = TypeVar("Self", bound="Learner")
 R = TypeVar("R")
 
 _VOTES_LENT = threading.Lock()  # held while a view's votes are taken out of the sum, by one thread at a time
-
-
-class UnusableViewError(Exception):
-    """A view that nothing can be learnt from; the message says why, in the words above."""
 
 
 def _check_num_classes(num_classes: int) -> None:
@@ -137,7 +132,7 @@ class Learner(ABC):
             view = view.held()  # Nothing else tells which votes were its own, should its file have changed by then.
         if self.memory_budget == 0 and view.name not in self.views:
             try:
-                sees = self._lift(view, self._read_usable(view), 1)
+                sees = self._lift(view, read_usable_mask(view, self.num_classes), 1)
             except UnusableViewError as why:
                 return self._add(view, why)
             return self._add(view, None if sees else UnusableViewError(SEES_NOTHING))
@@ -165,7 +160,7 @@ class Learner(ABC):
         if observation is not None:
             observation.vote(self._votes, UNITS, -1)
         else:
-            self._lift(view, self._read(view), -1)
+            self._lift(view, read_mask(view, self.num_classes), -1)
         self.forget(name)
 
     def forget(self, name: str) -> None:
@@ -287,7 +282,7 @@ class Learner(ABC):
         observation = self._prepared.get(name)
         if observation is None:
             view = self._observed(name)
-            observation = self._prepare(view, self._read(view))
+            observation = self._prepare(view, read_mask(view, self.num_classes))
             self._prepared.keep(name, observation)
         return observation
 
@@ -315,7 +310,7 @@ class Learner(ABC):
     def _opened(self, view: View) -> Observation | UnusableViewError:
         """Prepare a new view; return the error that says why, where it cannot be used."""
         try:
-            observation = self._prepare(view, self._read_usable(view))
+            observation = self._prepare(view, read_usable_mask(view, self.num_classes))
         except UnusableViewError as why:
             return why
         return observation if observation.num_pairs else UnusableViewError(SEES_NOTHING)
@@ -353,25 +348,6 @@ class Learner(ABC):
                 tick()
                 yield name, next(made)
 
-    def _read_usable(self, view: View) -> SeenLabels:
-        """Read the mask of a view that is new; raise `UnusableViewError` where it tells nothing."""
-        if not view.has_mask:
-            raise UnusableViewError(NO_MASK)
-        seen = self._read(view)
-        if not (seen.labels >= 0).any():
-            raise UnusableViewError(ALL_UNKNOWN)
-        return seen
-
-    def _read(self, view: View) -> SeenLabels:
-        """Read a mask; raise `UnknownLabelError` where it has labels beyond the classes, which have no votes."""
-        seen = view.read_seen()
-        if seen.largest >= self.num_classes:
-            raise UnknownLabelError(
-                f"{view.source}: mask holds the label {seen.largest}; expected at most "
-                f"{self.num_classes - 1}, since there are {self.num_classes} classes"
-            )
-        return seen
-
     def _operator_of(self, view: View) -> ViewOperator:
         return make_operator(self.scene, view.camera, self.device)
 
@@ -402,7 +378,7 @@ class Learner(ABC):
         self.code_rows_ = codes
 
     def _blend_codes(self, codes: CSRRows, view: View) -> np.ndarray:
-        background = bool((codes.indices == 0).any())
+        background = codes.has_column(0)
         return self._operator_of(view).blend_probabilities(codes, self.num_classes, background)
 
     def _possible(self) -> np.ndarray:

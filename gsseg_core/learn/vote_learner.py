@@ -8,6 +8,7 @@ import numpy as np
 
 from gsseg_core.data.view import View
 from gsseg_core.learn.learner import Learner, Progress, silent
+from gsseg_core.learn.usable_views import read_mask
 from gsseg_core.scene.camera import Camera
 
 
@@ -32,7 +33,7 @@ class VoteLearner(Learner):
         A view that sees nothing of the scene from there stays, without votes. On any error, nothing has changed.
         """
         before = self._observed(name)
-        after, seen = replace(before, camera=camera), self._read(before)
+        after, seen = replace(before, camera=camera), read_mask(before, self.num_classes)
         self._lift(after, seen, 1)
         self._lift(before, seen, -1)
         self.views[name] = after

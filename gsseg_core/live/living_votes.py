@@ -11,6 +11,7 @@ import numpy as np
 from gsseg_core.data.view import View
 from gsseg_core.errors import UnknownGroupError
 from gsseg_core.learn.learner_state import State
+from gsseg_core.learn.usable_views import read_mask
 from gsseg_core.learn.vote_learner import VoteLearner
 from gsseg_core.live.scene_change import SceneChange
 from gsseg_core.raster.backends import make_operator
@@ -109,7 +110,7 @@ class LivingVotes(VoteLearner):
         # In the order of groups, so that the scene is brought into the frame of each but once.
         for name in sorted(names, key=lambda name: str(views[name].group)):
             # A view that sees nothing any more is kept: it may see what is added later.
-            self._lift(views[name], self._read(views[name]), sign)
+            self._lift(views[name], read_mask(views[name], self.num_classes), sign)
 
     def _joined(self, view: View, group: int | None) -> View:
         """Have a view belong to a group: it stays where it is in the scene, and from then on moves along."""

@@ -25,7 +25,8 @@ from gsseg_core.learn.distributed.dask_cluster import PATIENCE, UNREACHABLE, che
 from gsseg_core.learn.distributed.dask_worker import Part
 from gsseg_core.learn.em.confusion_model import ErrorModel
 from gsseg_core.learn.em.em_learner import EMLearner
-from gsseg_core.learn.learner import Learner, Progress, UnusableViewError, silent
+from gsseg_core.learn.learner import Learner, Progress, silent
+from gsseg_core.learn.usable_views import UnusableViewError
 from gsseg_core.learn.vote_learner import VoteLearner
 from gsseg_core.scene.gaussian_scene import GaussianScene
 

@@ -21,7 +21,8 @@ from gsseg_core.data.view import View
 from gsseg_core.errors import GssegError
 from gsseg_core.learn.em.confusion_model import ErrorModel
 from gsseg_core.learn.em.em_learner import EMLearner, EMSettings
-from gsseg_core.learn.learner import UNITS, UnusableViewError
+from gsseg_core.learn.learner import UNITS
+from gsseg_core.learn.usable_views import UnusableViewError
 from gsseg_core.raster.vote_total import VoteTotal
 from gsseg_core.scene.gaussian_scene import GaussianScene
 from gsseg_core.scene.vertices import DC

@@ -197,7 +197,7 @@ class EMLearner(Learner):
             self.converged_ = small and last_round
             if self.converged_ or len(history) == settings.max_steps:
                 before, backend = rows_on(codes.with_data(codes.data.copy()), self.device)
-                background = bool((codes.indices == 0).any())
+                background = codes.has_column(0)
                 self._last_step_ = before, backend.put(gradient, self.device), background
             elif small:
                 self._refit_error_models(codes, gradient, prior.data, models, tick)
