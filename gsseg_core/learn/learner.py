@@ -31,6 +31,7 @@ from gsseg_core.raster.view_renderer import NO_PIXELS, PixelGrid, Strongest
 from gsseg_core.raster.vote_total import VoteTotal
 from gsseg_core.scene.gaussian_scene import GaussianScene
 from gsseg_core.several_at_once import each_with_made, several_at_once
+from gsseg_core.spatial.row_order import along_curve
 from gsseg_core.text import counted
 
 VOTE_UNIT = 2.0**-24  # votes are counted in whole multiples of this many px, so that adding and taking back are exact
@@ -103,7 +104,7 @@ class Learner(ABC):
         self.views: dict[str, View] = {}
         self.rejected: dict[str, str] = {}
         self._unfit()
-        self._votes = VoteTotal(len(scene), num_classes)
+        self._votes = VoteTotal(len(scene), num_classes, along_curve(scene))
         self._prepared = PreparedViews(memory_budget, with_file=device == "cpu")  # what lies on a GPU is not for a file
         self._turned = False
 
@@ -241,14 +242,15 @@ class Learner(ABC):
         """
         if (found := state.votes.num_rows) != len(self.scene):
             raise StateMismatchError(f"state is of {found} Gaussians; expected {len(self.scene)}, as the scene has")
-        votes = VoteTotal.from_rows(state.votes, state.num_classes)
+        order = along_curve(self.scene)
+        votes = VoteTotal.from_rows(state.votes, state.num_classes, order)
         self._unfit()
         self.views, self._votes = {view.name: view for view in state.views}, votes
         self.num_classes = state.num_classes
         self.rejected.clear()
         self._prepared.clear()
         if state.whole_rays:
-            self._votes = votes_cast_anew(state, self._operator_of, self._used_labels, UNITS)
+            self._votes = votes_cast_anew(state, self._operator_of, self._used_labels, UNITS, order)
 
     def vote_codes(self) -> np.ndarray:
         """Votes as probabilities, (N, K) float32; a row of zeros where no labelled pixel saw the Gaussian."""

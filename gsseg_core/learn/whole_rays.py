@@ -14,22 +14,23 @@ from gsseg_core.learn.learner_state import State
 from gsseg_core.raster.constants import CHANNELS
 from gsseg_core.raster.view_operator import ViewOperator
 from gsseg_core.raster.vote_total import VoteTotal
+from gsseg_core.spatial.row_order import RowOrder
 
 _ROUNDING = 1e-3  # what is taken from a vote differs from what was added by at most this share: rounding makes 1e-5
 
 
 def votes_cast_anew(
     state: State, operator_of: Callable[[View], ViewOperator], used: Callable[[SeenLabels, ViewOperator], SeenLabels],
-    units: float,
+    units: float, order: RowOrder,
 ) -> VoteTotal:  # fmt: skip
-    """Return the votes of a state; those of the views that it keeps by rays that end at surfaces.
+    """Return the votes of a state, in pages of an order; those of the views that it keeps by rays that end at surfaces.
 
     Votes of views that are not kept stay as they are. Those that the kept views had cast are computed again and taken
     from the sum. Rounding differs from when they were added, so what is left of a sum is 0 where it may be rounding.
     """
     shape, all_kept = (state.votes.num_rows, state.num_classes), state.num_fused == len(state.views)
-    left = VoteTotal(*shape) if all_kept else VoteTotal.from_rows(state.votes, state.num_classes)
-    anew, taken = VoteTotal(*shape), VoteTotal(*shape)
+    left = VoteTotal(*shape, order) if all_kept else VoteTotal.from_rows(state.votes, state.num_classes, order)
+    anew, taken = VoteTotal(*shape, order), VoteTotal(*shape, order)
     for view in state.views:
         operator = operator_of(view)
         seen = used(view.read_seen(), operator)

@@ -20,6 +20,7 @@ from gsseg_core.raster.view_operator import ViewOperator
 from gsseg_core.raster.vote_total import VoteTotal
 from gsseg_core.scene.group_frames import IDENTITY, is_identity
 from gsseg_core.scene.living_scene import LivingScene
+from gsseg_core.spatial.row_order import along_curve
 
 
 class LivingVotes(VoteLearner):
@@ -83,11 +84,12 @@ class LivingVotes(VoteLearner):
         # To take a view back costs as much as to add it: with more than half of them, all are lifted from nothing.
         from_nothing = all_kept and 2 * len(lifted) > len(views)
         names = list(views) if from_nothing else lifted
+        order = along_curve(change.after.scene)
         if from_nothing:
-            self._votes = VoteTotal(len(change.after), self.num_classes)
+            self._votes = VoteTotal(len(change.after), self.num_classes, order)
         else:
             self._lift_all(self.views, lifted, -1)
-            self._votes = VoteTotal.from_rows(change.carry(self._votes.rows()), self.num_classes)
+            self._votes = VoteTotal.from_rows(change.carry(self._votes.rows()), self.num_classes, order)
         self.living, self.scene = change.after, change.after.scene
         self._lift_all(views, names, 1)
         self.views = views

@@ -24,6 +24,7 @@ from gsseg_core.objects.object_table import ObjectTable, Repair, object_name
 from gsseg_core.raster.vote_total import VoteTotal
 from gsseg_core.scene.camera import Camera
 from gsseg_core.segmentation import Segmentation
+from gsseg_core.spatial.row_order import along_curve
 
 
 class PerViewSession(LiveSession):
@@ -149,7 +150,7 @@ class PerViewSession(LiveSession):
         with self._lock:
             loaded = super().load(path, within)
             known = self._live.state()
-            votes = VoteTotal.from_rows(known.votes, known.num_classes)
+            votes = VoteTotal.from_rows(known.votes, known.num_classes, along_curve(self.scene))
             for view in self._live.views.values():
                 if observation := self._table.adopt(view):
                     observation.vote(votes, UNITS, -1)

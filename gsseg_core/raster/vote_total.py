@@ -1,9 +1,8 @@
 """The votes of all views: of many classes, neighbours in space have votes for a few, and only those are kept.
 
-A *page* has the votes for one class of `PAGE` Gaussians that follow each other. Commands put the Gaussians of a scene
-in the order of a space-filling curve, so these are neighbours, and most pages would hold nothing: there are none of
-those. Larger pages would have more zeros, above all where Gaussians are in no such order, and smaller ones need a
-larger table of their numbers.
+A *page* has the votes for one class of `PAGE` Gaussians that follow each other in a `RowOrder`: along a space-filling
+curve, so that these are neighbours, and most pages would hold nothing: there are none of those. Larger pages would have
+more zeros, and smaller ones need a larger table of their numbers.
 """
 
 from __future__ import annotations
@@ -17,6 +16,7 @@ from gsseg_core.csr_rows import CSRRows
 from gsseg_core.data.label_evidence import vote_units
 from gsseg_core.kernels.compiler import called_by_kernels, kernel
 from gsseg_core.simd import AHEAD, prefetch
+from gsseg_core.spatial.row_order import RowOrder
 
 _BITS = 5
 PAGE = 1 << _BITS  # Gaussians of a page
@@ -33,17 +33,21 @@ class PairVotes(NamedTuple):
 
 
 class VoteTotal:
-    """Votes of N Gaussians for K classes, in whole units, int64: what is added can be taken back exactly."""
+    """Votes of N Gaussians for K classes, in whole units, int64: what is added can be taken back exactly.
 
-    def __init__(self, num_gaussians: int, num_classes: int) -> None:
+    Pages hold the Gaussians in an `order`, by default their own. Nothing but memory and time depends on it.
+    """
+
+    def __init__(self, num_gaussians: int, num_classes: int, order: RowOrder | None = None) -> None:
         self._num_gaussians = num_gaussians
+        self.order = order or RowOrder.own(num_gaussians)
         self._table = np.full((-(-num_gaussians // PAGE), num_classes), _NONE, np.int32)  # page of a block and class
         self._pages, self._count = np.zeros((0, PAGE), np.int64), 0  # pages, and how many of them are in use
 
     @classmethod
-    def from_rows(cls, rows: CSRRows, num_classes: int) -> VoteTotal:
+    def from_rows(cls, rows: CSRRows, num_classes: int, order: RowOrder | None = None) -> VoteTotal:
         """Make it of the votes that are not zero."""
-        total = cls(rows.num_rows, num_classes)
+        total = cls(rows.num_rows, num_classes, order)
         total.add_rows(rows)
         return total
 
@@ -54,7 +58,7 @@ class VoteTotal:
 
     @property
     def nbytes(self) -> int:
-        """Bytes that it takes."""
+        """Bytes that it takes, besides the order."""
         return self._table.nbytes + self._pages.nbytes
 
     def most_classes(self, nbytes: int) -> int:
@@ -67,20 +71,20 @@ class VoteTotal:
         A pixel of each label votes as the rows `label_votes` say, float64. Where there is too little memory, nothing
         has changed.
         """
-        self._make_pages(_mark_pairs(self._table, cast, label_votes))
-        add_pairs(self._table, self._pages.reshape(-1), cast, label_votes, units, sign)
+        self._make_pages(_mark_pairs(self._table, self.order.places, cast, label_votes))
+        add_pairs(self._table, self.order.places, self._pages.reshape(-1), cast, label_votes, units, sign)
 
     def add_rows(self, rows: CSRRows, first: int = 0) -> None:
         """Add votes in units, int64, to those of consecutive Gaussians from the `first` on."""
-        self._make_pages(_mark_rows(self._table, rows, first))
-        _add_rows(self._table, self._pages.reshape(-1), rows, first)
+        self._make_pages(_mark_rows(self._table, self.order.places, rows, first))
+        _add_rows(self._table, self.order.places, self._pages.reshape(-1), rows, first)
 
     def rows(self) -> CSRRows:
         """Return the votes that are not zero."""
         counts = np.zeros(self._num_gaussians, np.int64)
-        _count(self._table, self._pages, counts)
+        _count(self._table, self.order.order, self._pages, counts)
         rows = CSRRows.room_for(counts, np.int64)
-        _fill(self._table, self._pages, rows)
+        _fill(self._table, self.order.order, self._pages, rows)
         return rows
 
     def dense(self) -> np.ndarray:
@@ -89,7 +93,7 @@ class VoteTotal:
 
     def copy(self) -> VoteTotal:
         """Return another one like it."""
-        other = VoteTotal(*self.shape)
+        other = VoteTotal(*self.shape, self.order)
         other._table[:], other._pages, other._count = self._table, self._pages[: self._count].copy(), self._count
         return other
 
@@ -124,9 +128,9 @@ class VoteTotal:
 
 
 @called_by_kernels
-def _cell(table: np.ndarray, i: int, k: int) -> np.int64:
-    """Where the votes of a Gaussian for a class are, among those of all pages."""
-    return (np.int64(table[i >> _BITS, k]) << _BITS) | (i & (PAGE - 1))
+def _cell(table: np.ndarray, place: int, k: int) -> np.int64:
+    """Where the votes of the Gaussian at a place for a class are, among those of all pages."""
+    return (np.int64(table[place >> _BITS, k]) << _BITS) | (place & (PAGE - 1))
 
 
 @called_by_kernels
@@ -139,12 +143,12 @@ def _want(table: np.ndarray, block: int, k: int) -> bool:
 
 
 @kernel(parallel=True)
-def _mark_pairs(table: np.ndarray, cast: PairVotes, label_votes: CSRRows) -> np.ndarray:
+def _mark_pairs(table: np.ndarray, places: np.ndarray, cast: PairVotes, label_votes: CSRRows) -> np.ndarray:
     gaussians, labels, _, parts = cast
     marked = np.zeros(table.shape[0], np.bool_)
     for part in nb.prange(parts.shape[0]):
         for s in range(parts[part, 0], parts[part, 1]):
-            block = gaussians[s] >> _BITS
+            block = places[gaussians[s]] >> _BITS
             for z in range(label_votes.indptr[labels[s]], label_votes.indptr[labels[s] + 1]):
                 if _want(table, block, label_votes.indices[z]):
                     marked[block] = True
@@ -153,7 +157,8 @@ def _mark_pairs(table: np.ndarray, cast: PairVotes, label_votes: CSRRows) -> np.
 
 @kernel(parallel=True)
 def add_pairs(
-    table: np.ndarray, cells: np.ndarray,  # (blocks, K) with a page wherever one is needed; (pages * PAGE,)
+    table: np.ndarray, places: np.ndarray,  # (blocks, K) with a page wherever one is needed; (N,) int32
+    cells: np.ndarray,  # (pages * PAGE,)
     cast: PairVotes, label_votes: CSRRows, units: float, sign: int,
 ) -> None:  # fmt: skip
     """Add a view's votes to the cells of pages, or take them away; see `VoteTotal.add`."""
@@ -164,18 +169,18 @@ def add_pairs(
             later = min(s + AHEAD, parts[part, 1] - 1)
             first = label_votes.indptr[labels[later]]
             column = label_votes.indices[first] if first < len(label_votes.indices) else 0
-            prefetch(cells, _cell(table, gaussians[later], column))
+            prefetch(cells, _cell(table, places[gaussians[later]], column))
             for z in range(label_votes.indptr[labels[s]], label_votes.indptr[labels[s] + 1]):
                 added = sign * vote_units(weights[s], label_votes.data[z], units)
-                cells[_cell(table, gaussians[s], label_votes.indices[z])] += added
+                cells[_cell(table, places[gaussians[s]], label_votes.indices[z])] += added
 
 
 @kernel(parallel=True)
-def _mark_rows(table: np.ndarray, rows: CSRRows, first: int) -> np.ndarray:
+def _mark_rows(table: np.ndarray, places: np.ndarray, rows: CSRRows, first: int) -> np.ndarray:
     indptr, classes, _ = rows
     marked = np.zeros(table.shape[0], np.bool_)
     for i in nb.prange(indptr.shape[0] - 1):
-        block = (first + i) >> _BITS
+        block = places[first + i] >> _BITS
         for z in range(indptr[i], indptr[i + 1]):
             if _want(table, block, classes[z]):
                 marked[block] = True
@@ -183,15 +188,15 @@ def _mark_rows(table: np.ndarray, rows: CSRRows, first: int) -> np.ndarray:
 
 
 @kernel(parallel=True)
-def _add_rows(table: np.ndarray, cells: np.ndarray, rows: CSRRows, first: int) -> None:
+def _add_rows(table: np.ndarray, places: np.ndarray, cells: np.ndarray, rows: CSRRows, first: int) -> None:
     indptr, classes, votes = rows
     for i in nb.prange(indptr.shape[0] - 1):
         for z in range(indptr[i], indptr[i + 1]):
-            cells[_cell(table, first + i, classes[z])] += votes[z]
+            cells[_cell(table, places[first + i], classes[z])] += votes[z]
 
 
 @kernel(parallel=True)
-def _count(table: np.ndarray, pages: np.ndarray, counts: np.ndarray) -> None:
+def _count(table: np.ndarray, order: np.ndarray, pages: np.ndarray, counts: np.ndarray) -> None:
     for block in nb.prange(table.shape[0]):
         first = block * PAGE
         size = min(PAGE, counts.shape[0] - first)
@@ -199,20 +204,20 @@ def _count(table: np.ndarray, pages: np.ndarray, counts: np.ndarray) -> None:
             if table[block, k] >= 0:
                 page = pages[table[block, k]]
                 for i in range(size):
-                    counts[first + i] += page[i] != 0
+                    counts[order[first + i]] += page[i] != 0
 
 
 @kernel(parallel=True)
-def _fill(table: np.ndarray, pages: np.ndarray, rows: CSRRows) -> None:
+def _fill(table: np.ndarray, order: np.ndarray, pages: np.ndarray, rows: CSRRows) -> None:
     indptr, classes, votes = rows
     for block in nb.prange(table.shape[0]):
         first = block * PAGE
         size = min(PAGE, indptr.shape[0] - 1 - first)
-        places = indptr[first : first + size].copy()  # where the next entry of each row goes
+        nexts = indptr[order[first : first + size]]  # where the next entry of each row goes
         for k in range(table.shape[1]):
             if table[block, k] >= 0:
                 page = pages[table[block, k]]
                 for i in range(size):
                     if page[i] != 0:
-                        classes[places[i]], votes[places[i]] = k, page[i]
-                        places[i] += 1
+                        classes[nexts[i]], votes[nexts[i]] = k, page[i]
+                        nexts[i] += 1

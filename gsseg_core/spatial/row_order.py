@@ -3,19 +3,45 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import Any
+from typing import Any, NamedTuple
 
 import numba as nb
 import numpy as np
 
 from gsseg_core.kernels.compiler import kernel
 from gsseg_core.scene.gaussian_scene import ACTIVATED, GaussianScene
+from gsseg_core.scene.scene_cache import PerScene
 from gsseg_core.simd import AHEAD, prefetch
 
 _CELLS = 1 << 10  # along each axis: three numbers of ten bits make one of thirty
 _SAMPLE = 1 << 16  # Gaussians by which the box of the curve is found
 _TAIL = 1.0  # percent of these on each side that may lie outside, so that a far floater makes no cell large
 _LINE = 16  # numbers of 32 bits in a cache line
+
+
+class RowOrder(NamedTuple):
+    """In which order arrays hold the N Gaussians of a scene."""
+
+    order: np.ndarray  # (N,) int32: the Gaussian at each place
+    places: np.ndarray  # (N,) int32: the place of each Gaussian
+
+    @classmethod
+    def own(cls, count: int) -> RowOrder:
+        """Leave them in the order that they have."""
+        return cls(*(np.arange(count, dtype=np.int32) for _ in cls._fields))
+
+
+_KNOWN: PerScene[RowOrder] = PerScene()
+
+
+def along_curve(scene: GaussianScene) -> RowOrder:
+    """Order the Gaussians of a scene by `curve_order`; it is kept as long as the scene."""
+
+    def found() -> RowOrder:
+        order = curve_order(scene.means).astype(np.int32)
+        return RowOrder(order, inverse(order))
+
+    return _KNOWN.of(scene, found)
 
 
 def curve_order(means: np.ndarray) -> np.ndarray:
@@ -52,10 +78,10 @@ def _spread(number: np.ndarray) -> np.ndarray:
     return number
 
 
-def inverse(order: np.ndarray) -> np.ndarray:  # (N,) int64
-    """Place of each index in an order, (N,) int64."""
+def inverse(order: np.ndarray) -> np.ndarray:  # (N,) integers
+    """Place of each index in an order, (N,) of the same type."""
     places = np.empty_like(order)
-    places[order] = np.arange(len(order))
+    places[order] = np.arange(len(order), dtype=order.dtype)
     return places
 
 

@@ -20,6 +20,7 @@ from gsseg_core.live.results import Rejection
 from gsseg_core.live.session import LiveSession
 from gsseg_core.refine.settings import PAPER, UNREFINED, RefineSettings
 from gsseg_core.scene.scene_delta import SceneDelta
+from gsseg_core.spatial.row_order import along_curve
 
 SCENE, _ = balls_on_a_table()
 VIEWS = clean_views(5)
@@ -72,6 +73,7 @@ def everything(session: LiveSession) -> list[object]:
 
 def assert_counts_agree(session: LiveSession) -> None:
     assert session.num_views <= min(session.num_fused, session.max_views)
+    assert session._live._votes.order is along_curve(session.scene), "votes of neighbours are together"
     if session.has_codes:
         codes = session.codes()
         assert codes.shape == (len(session.scene), len(session.class_names))

@@ -13,6 +13,7 @@ from hypothesis import strategies as st
 from gsseg_core.csr_rows import CSRRows
 from gsseg_core.raster import vote_total
 from gsseg_core.raster.vote_total import PAGE, PairVotes, VoteTotal
+from gsseg_core.spatial.row_order import RowOrder, inverse
 
 UNITS = 2.0**24
 
@@ -35,6 +36,12 @@ def cast(rng: np.random.Generator, n: int, k: int) -> tuple[PairVotes, CSRRows]:
     )
 
 
+def some_order(rng: np.random.Generator, n: int) -> RowOrder | None:
+    """Draw an order of Gaussians in pages, half of the time."""
+    order = rng.permutation(n).astype(np.int32)
+    return RowOrder(order, inverse(order)) if rng.random() < 0.5 else None
+
+
 def dense_votes(shape: tuple[int, int], votes: PairVotes, label_votes: CSRRows) -> np.ndarray:
     """What a view votes, (N, K) int64, one after the other."""
     out, by_label = np.zeros(shape, np.int64), label_votes.dense(shape[1])
@@ -51,7 +58,7 @@ def test_views_that_are_added_and_taken_back_in_any_order_leave_the_sums_of_a_de
     n: int, k: int, seed: int
 ) -> None:
     rng = np.random.default_rng(seed)
-    total, expected, there = VoteTotal(n, k), np.zeros((n, k), np.int64), []
+    total, expected, there = VoteTotal(n, k, some_order(rng, n)), np.zeros((n, k), np.int64), []
     for _ in range(8):
         if there and rng.random() < 0.4:
             view, sign = there.pop(int(rng.integers(len(there)))), -1
@@ -69,11 +76,11 @@ def test_views_that_are_added_and_taken_back_in_any_order_leave_the_sums_of_a_de
     assert not len(total.rows().data)
 
 
-def test_the_order_of_views_changes_nothing_but_the_numbers_of_pages() -> None:
+def test_the_order_of_views_and_of_gaussians_in_pages_changes_nothing_but_the_pages() -> None:
     rng = np.random.default_rng(0)
     views, found = [cast(rng, 700, 5) for _ in range(3)], []
     for order in permutations(views):
-        total = VoteTotal(700, 5)
+        total = VoteTotal(700, 5, some_order(rng, 700))
         for view in order:
             total.add(*view, UNITS)
         found.append(total.rows())
@@ -86,10 +93,10 @@ def test_the_order_of_views_changes_nothing_but_the_numbers_of_pages() -> None:
 def test_rows_go_in_and_come_out_whole_or_part_by_part(n: int, k: int, seed: int) -> None:
     rng = np.random.default_rng(seed)
     votes = rng.integers(-(2**60), 2**60, (n, k)) * (rng.random((n, k)) < 0.3)
-    total = VoteTotal.from_rows(CSRRows.from_dense(votes), k)
+    total = VoteTotal.from_rows(CSRRows.from_dense(votes), k, some_order(rng, n))
     assert total.shape == (n, k)
     np.testing.assert_array_equal(total.dense(), votes)
-    in_parts, step = VoteTotal(n, k), int(rng.integers(1, n + 1))
+    in_parts, step = VoteTotal(n, k, some_order(rng, n)), int(rng.integers(1, n + 1))
     for first in range(0, n, step):
         in_parts.add_rows(CSRRows.from_dense(votes[first : first + step]), first)
     np.testing.assert_array_equal(in_parts.dense(), votes)
@@ -101,7 +108,7 @@ def test_rows_go_in_and_come_out_whole_or_part_by_part(n: int, k: int, seed: int
 def test_a_copy_is_independent_and_classes_come_and_go(n: int, k: int, other: int, seed: int) -> None:
     rng = np.random.default_rng(seed)
     first, second = (rng.integers(-5, 6, (n, k)) * (rng.random((n, k)) < 0.3) for _ in range(2))
-    total = VoteTotal.from_rows(CSRRows.from_dense(first), k)
+    total = VoteTotal.from_rows(CSRRows.from_dense(first), k, some_order(rng, n))
     copies = total.copy(), pickle.loads(pickle.dumps(total))
     total.add_rows(CSRRows.from_dense(second))
     for copy in copies:
@@ -137,6 +144,12 @@ def test_of_many_classes_neighbours_have_few_and_that_is_what_is_kept() -> None:
     assert total.nbytes < 8 * n * k / 25
     assert total.most_classes(total.nbytes) == k == total.most_classes(0)
     assert total.most_classes(total.nbytes + 4 * 100 * 17) == k + 17, "a class without votes takes 4 bytes of a block"
+    # Where neighbours are anywhere among all, they are found again by an order that knows where.
+    order = np.random.default_rng(1).permutation(n).astype(np.int32)
+    anywhere = CSRRows.from_dense(votes[inverse(order)])
+    found = VoteTotal.from_rows(anywhere, k, RowOrder(order, inverse(order)))
+    np.testing.assert_array_equal(found.dense(), votes[inverse(order)])
+    assert found.nbytes == total.nbytes < VoteTotal.from_rows(anywhere, k).nbytes / 5
 
 
 def test_without_memory_for_pages_nothing_changes(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -152,7 +165,7 @@ def test_without_memory_for_pages_nothing_changes(monkeypatch: pytest.MonkeyPatc
     with monkeypatch.context() as patch:
         patch.setattr(vote_total.np, "zeros", full)
         with pytest.raises(MemoryError):
-            total._make_pages(vote_total._mark_pairs(total._table, *second))
+            total._make_pages(vote_total._mark_pairs(total._table, total.order.places, *second))
     np.testing.assert_array_equal(total.dense(), before)
     total.add(*second, UNITS)
     np.testing.assert_array_equal(total.dense(), before + dense_votes((600, 7), *second))

@@ -10,7 +10,7 @@ from numpy.lib import recfunctions
 from small_scenes import balls_on_a_table
 
 from gsseg_core.scene.gaussian_scene import GaussianScene
-from gsseg_core.spatial.row_order import curve_order, reordered, rows_by_label, take_rows
+from gsseg_core.spatial.row_order import along_curve, curve_order, reordered, rows_by_label, take_rows
 
 
 def cell_number(x: int, y: int, z: int) -> int:
@@ -46,6 +46,15 @@ def test_neighbours_are_near_each_other_also_with_a_floater_far_away() -> None:
     along = np.delete(means[curve_order(means)], np.flatnonzero(curve_order(means) == 7), axis=0)
     step = np.median(np.abs(np.diff(along, axis=0)).sum(axis=1))
     assert step < 0.1 * np.median(np.abs(np.diff(np.delete(means, 7, axis=0), axis=0)).sum(axis=1))
+
+
+def test_the_order_of_a_scene_is_that_of_its_means_and_is_found_once() -> None:
+    scene, _ = balls_on_a_table()
+    order, places = found = along_curve(scene)
+    np.testing.assert_array_equal(order, curve_order(scene.means))
+    np.testing.assert_array_equal(order[places], np.arange(len(scene)))
+    assert order.dtype == places.dtype == np.int32
+    assert along_curve(scene) is found and along_curve(scene.subset(np.arange(9))) is not found
 
 
 @pytest.mark.parametrize("added", [None, "u1", "<f8"], ids=["floats", "odd bytes", "doubles"])

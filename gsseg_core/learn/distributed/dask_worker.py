@@ -26,6 +26,7 @@ from gsseg_core.learn.usable_views import UnusableViewError
 from gsseg_core.raster.vote_total import VoteTotal
 from gsseg_core.scene.gaussian_scene import GaussianScene
 from gsseg_core.scene.vertices import DC
+from gsseg_core.spatial.row_order import along_curve
 
 Part = tuple[Any, dict[str, Any]]
 """A sum over some views, of int64, perhaps sparse, or None; and by view what else came out."""
@@ -87,7 +88,7 @@ def prepare(
 
 def sum_votes(shard: Shard, wanted: dict[str, Any]) -> Part:
     """Count votes; beside them, why a view was rejected, or ""."""
-    votes = VoteTotal(len(shard.scene), shard.num_classes)
+    votes = VoteTotal(len(shard.scene), shard.num_classes, along_curve(shard.scene))
     with _all_threads():
         for name in wanted:
             if name in shard.views:
