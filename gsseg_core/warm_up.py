@@ -25,7 +25,7 @@ from gsseg_core.learn.em.em_learner import EMLearner, EMSettings
 from gsseg_core.learn.mask_reliability import compare_mask
 from gsseg_core.learn.vote_learner import VoteLearner
 from gsseg_core.learn.vote_resolution import resolved_votes
-from gsseg_core.objects.association_kernels import call_all
+from gsseg_core.objects import association_kernels, move_kernels
 from gsseg_core.objects.clicks import merge_tree
 from gsseg_core.objects.column_products import column_products
 from gsseg_core.objects.heaviest import heaviest
@@ -166,7 +166,8 @@ def refine_something(device: str = "cpu") -> None:
     edges = sum(np.abs(np.diff(true, axis=axis, prepend=0)) for axis in (0, 1))
     align_boundaries(wide, 3 * np.asarray(edges, np.float32), EMSettings.edge_px)  # The region's outline moves.
     merge_tree(labels[..., None])  # as for points in a view
-    call_all()  # as for ids of each view's own
+    association_kernels.call_all()  # as for ids of each view's own
+    move_kernels.call_all()
     column_products(np.eye(2), np.arange(2))  # as for parts of objects
     share = np.clip(0.5 + scene.means[:, 0], 0.05, 0.95)  # Unsure in the middle, where neighbours decide.
     codes = np.stack([1 - share, share], axis=1).astype(np.float32)

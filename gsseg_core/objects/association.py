@@ -37,7 +37,6 @@ Nothing depends on the order of views or ids, nor on how many there are.
 
 from __future__ import annotations
 
-import itertools
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import NamedTuple
@@ -48,7 +47,8 @@ from scipy import sparse
 from gsseg_core.errors import SettingsError
 from gsseg_core.objects.association_kernels import dots_of_pairs
 from gsseg_core.objects.depth_edges import Borders
-from gsseg_core.objects.lifted_segments import Lifted, Profiles
+from gsseg_core.objects.lifted_segments import Lifted
+from gsseg_core.objects.move_kernels import add_objects, by_view, explain_segments
 from gsseg_core.objects.sparse_products import product_above
 from gsseg_core.objects.stacked_segments import Stack, grouping
 
@@ -328,15 +328,15 @@ def _move(stack: Stack, objects: np.ndarray, settings: AssociationSettings) -> n
 
     That ends when none moves any more, or when some do nothing but change places with each other.
     """
-    parts = [slice(*bounds) for bounds in itertools.pairwise(stack.starts.tolist())]
-    before, weights = objects, stack.weights().T.astype(np.float64).tocsr()
+    before, weights = objects, stack.weights().T.tocsr()
+    by_gaussian = weights.indptr, weights.indices, weights.data
+    views = by_view(*by_gaussian, stack.starts, *stack.gaussians())
     for _ in range(settings.rounds):
-        earlier, before, objects = before, objects, objects.copy()
-        profiles = Profiles((weights @ grouping(before).T).tocsr())
-        for view, rows in zip(stack.views, parts, strict=True):
-            best, seen = profiles.explain(view, before[rows])
-            moves = ~stack.background[rows] & (seen >= settings.unseen)
-            objects[rows] = np.where(moves, best, before[rows])
+        earlier, before, num = before, objects, int(objects.max(initial=0)) + 1
+        best, known = explain_segments(views, *add_objects(*by_gaussian, before, num), before, num)
+        seen = np.divide(known, stack.size, out=np.zeros_like(known), where=stack.size > 0)
+        moves = ~stack.background & (seen >= settings.unseen)
+        objects = np.where(moves, best, before)
         if (objects == before).all() or (objects == earlier).all():
             break
     return objects

@@ -62,21 +62,6 @@ def dots_of_pairs(first: np.ndarray, second: np.ndarray, rows: np.ndarray) -> np
 
 
 @kernel(parallel=True)
-def take_away(
-    indptr: np.ndarray, objects: np.ndarray, weights: np.ndarray,
-    own_indptr: np.ndarray, own_objects: np.ndarray, own_weights: np.ndarray,
-) -> None:  # fmt: skip
-    """Take one view's own weights from those of the objects on each Gaussian that it sees, in place."""
-    for m in nb.prange(len(indptr) - 1):
-        for z in range(indptr[m], indptr[m + 1]):
-            for j in range(own_indptr[m], own_indptr[m + 1]):
-                if own_objects[j] == objects[z]:
-                    weights[z] -= own_weights[j]
-            if weights[z] < 1e-6:  # Where this view was the only one, rounding is left.
-                weights[z] = 0.0
-
-
-@kernel(parallel=True)
 def add_common(
     indptr: np.ndarray, gaussians: np.ndarray, weights: np.ndarray,
     profile_indptr: np.ndarray, objects: np.ndarray, profile: np.ndarray,
@@ -99,5 +84,4 @@ def call_all() -> None:
     rows_above(indptr, none, small, indptr, none, small, row, one.astype(np.int32), row, row.astype(np.int32), one)
     pack(row, row.astype(np.int32), one, one, small, none)
     dots_of_pairs(one[:0], one[:0], row)
-    take_away(indptr, none, small.astype(np.float64), indptr, one[:0], small)
     add_common(indptr, none, small, indptr, none, small.astype(np.float64), np.zeros(1), np.zeros((1, 1)), np.zeros(1))

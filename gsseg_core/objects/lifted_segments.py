@@ -9,7 +9,7 @@ from scipy import sparse
 
 from gsseg_core.csr_rows import CSRRows, starts
 from gsseg_core.metrics import iou
-from gsseg_core.objects.association_kernels import add_common, take_away
+from gsseg_core.objects.association_kernels import add_common
 from gsseg_core.objects.depth_edges import Borders, borders, depth_edges
 from gsseg_core.objects.heaviest import heaviest
 from gsseg_core.raster.observation import LabelWeights, Observation
@@ -103,35 +103,27 @@ class Profiles:
             self._sum, self._more = sparse.coo_matrix((data, (row, col)), shape=shape).tocsr(), []
         return self._sum
 
-    def common(self, segments: Lifted, objects: np.ndarray | None = None) -> tuple[np.ndarray, np.ndarray]:
-        """How much of L segments of a view lies on each object, (L, K), and on known Gaussians, (L,), in px.
-
-        With `objects`, (L,), which these segments have been added as, only what the other views say counts.
-        """
-        present, common, known = self._common(segments, objects)
+    def common(self, segments: Lifted) -> tuple[np.ndarray, np.ndarray]:
+        """How much of L segments of a view lies on each object, (L, K), and on known Gaussians, (L,), in px."""
+        present, common, known = self._common(segments)
         every = np.zeros((len(segments), self.weights.shape[1]))
         every[:, present] = common
         return every, known
 
-    def explain(self, segments: Lifted, objects: np.ndarray | None = None) -> tuple[np.ndarray, np.ndarray]:
+    def explain(self, segments: Lifted) -> tuple[np.ndarray, np.ndarray]:
         """Find the object of the largest IoU with each segment of a view, (L,), 0 where there is none.
 
-        Also returns the share of each segment that lies on Gaussians of which anything is known, (L,). Takes what
-        `common` takes.
+        Also returns the share of each segment that lies on Gaussians of which anything is known, (L,).
         """
-        present, common, known = self._common(segments, objects)
+        present, common, known = self._common(segments)
         overlap = np.nan_to_num(iou(common, known[:, None], common.sum(axis=0)))
         whole = sums(segments.weights, 1)
         best = np.where(overlap.any(axis=1), present[overlap.argmax(axis=1)], 0)
         return best, np.divide(known, whole, out=np.zeros_like(known), where=whole > 0)
 
-    def _common(self, segments: Lifted, objects: np.ndarray | None) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    def _common(self, segments: Lifted) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Find which objects are on the Gaussians of the segments, (U,) with 0, and `common` of these, (L, U)."""
         profile = self.weights[segments.gaussians].astype(np.float64, copy=False)
-        if objects is not None:
-            own = segments.weights.T.tocsr()
-            of_own = objects.astype(np.int64, copy=False)[own.indices]
-            take_away(profile.indptr, profile.indices, profile.data, own.indptr, of_own, own.data)
         present, column = without_gaps(np.append(profile.indices, 0))
         common, known, weights = np.zeros((len(segments), len(present))), np.zeros(len(segments)), segments.weights
         add_common(

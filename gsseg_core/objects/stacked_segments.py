@@ -7,6 +7,7 @@ from dataclasses import replace
 import numpy as np
 from scipy import sparse
 
+from gsseg_core.csr_rows import starts
 from gsseg_core.objects.depth_edges import Borders
 from gsseg_core.objects.lifted_segments import Lifted, sums, without_gaps
 from gsseg_core.objects.sparse_products import product_above
@@ -18,7 +19,7 @@ class Stack:
     """The n segments of all views, stacked; Gaussians that no view sees take no part."""
 
     def __init__(self, views: list[Lifted]) -> None:
-        self.starts = np.concatenate([[0], np.cumsum([len(view) for view in views])])
+        self.starts = starts(np.array([len(view) for view in views]))
         self.view = np.repeat(np.arange(len(views)), np.diff(self.starts))
         self.background = np.concatenate([view.ids for view in views]) == 0
         self.size = np.concatenate([sums(view.weights, 1) for view in views])
@@ -30,6 +31,11 @@ class Stack:
     def weights(self) -> sparse.csr_matrix:
         """Weights of the segments on the Gaussians, (n, I) float32, in px."""
         return self._stacked([view.weights.data for view in self.views])
+
+    def gaussians(self) -> tuple[np.ndarray, np.ndarray]:
+        """Where the Gaussians of each view begin, (views + 1,), and which they are, view after view, (M,)."""
+        parts = [view.gaussians for view in self.views]
+        return starts(np.array([len(part) for part in parts])), np.concatenate(parts)
 
     def borders(self) -> Borders:
         """Borders between the segments of each view."""

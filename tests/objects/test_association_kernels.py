@@ -12,12 +12,14 @@ from per_view_ids import row_of_objects
 from scipy import sparse
 
 from gsseg_core.objects import association
-from gsseg_core.objects.association import AssociationSettings
+from gsseg_core.objects.association import AssociationSettings, associate
 from gsseg_core.objects.lifted_segments import Lifted, Profiles
+from gsseg_core.objects.move_kernels import add_objects, by_view, explain_segments
 from gsseg_core.objects.sparse_products import product_above
 from gsseg_core.objects.stacked_segments import Stack
 
 SETTINGS = AssociationSettings()
+WEIGHTS = sparse.csr_matrix(np.full((1, 2), 4, np.float32))
 
 
 def drawn_views(seed: int, num: int, background: bool) -> list[Lifted]:
@@ -113,22 +115,67 @@ def explained_densely(profile: np.ndarray, view: Lifted, objects: np.ndarray | N
     return weights @ np.divide(rest, total, out=np.zeros_like(rest), where=total > 0), weights @ (total[:, 0] > 0)
 
 
-@pytest.mark.parametrize("left_out", [False, True])
-def test_what_segments_have_in_common_with_objects_is_that_of_the_definition(left_out: bool) -> None:
+def best_of(common: np.ndarray, known: np.ndarray) -> np.ndarray:
+    """The object of the largest IoU with each segment, by what is in common with each, (L, K)."""
+    iou = common / np.maximum(known[:, None] + common.sum(axis=0) - common, 1e-12)
+    return np.asarray(iou.argmax(axis=1))
+
+
+def drawn_objects(views: list[Lifted]) -> tuple[list[np.ndarray], np.ndarray]:
+    """Twelve objects that segments are of, by chance, and their weights (N, K); ten Gaussians more than any sees."""
     rng = np.random.default_rng(0)
-    views = drawn_views(2, 5, True)
-    objects = [rng.integers(0, 12, len(view)) for view in views]
-    profiles, dense = Profiles.empty(330), np.zeros((330, 12))  # Ten Gaussians more than any view sees.
-    for view, numbers in zip(views[1:], objects[1:], strict=True):
-        profiles.add(view, numbers)
+    objects, dense = [rng.integers(0, 12, len(view)) for view in views], np.zeros((330, 12))
+    for view, numbers in zip(views, objects, strict=True):
         for a, k in enumerate(numbers):
             dense[view.gaussians, k] += view.weights[a].toarray().ravel()
-    view, own = (views[1], objects[1]) if left_out else (views[0], None)
-    found, expected = profiles.common(view, own), explained_densely(dense, view, own)
+    return objects, dense
+
+
+def test_what_segments_have_in_common_with_objects_is_that_of_the_definition() -> None:
+    views = drawn_views(2, 5, True)
+    objects, dense = drawn_objects(views[1:])
+    profiles, view = Profiles.empty(330), views[0]
+    for other, numbers in zip(views[1:], objects, strict=True):
+        profiles.add(other, numbers)
+    found, expected = profiles.common(view), explained_densely(dense, view, None)
     for one, other in zip(found, expected, strict=True):
         np.testing.assert_allclose(one, other, rtol=1e-9, atol=1e-9)
-    best, seen = profiles.explain(view, own)
-    common, known = expected
-    iou = common / np.maximum(known[:, None] + common.sum(axis=0) - common, 1e-12)
-    np.testing.assert_array_equal(best, iou.argmax(axis=1))
-    np.testing.assert_allclose(seen, known / view.weights.toarray().sum(axis=1), rtol=1e-6)
+    best, seen = profiles.explain(view)
+    np.testing.assert_array_equal(best, best_of(*expected))
+    np.testing.assert_allclose(seen, expected[1] / view.weights.toarray().sum(axis=1), rtol=1e-6)
+
+
+@pytest.mark.parametrize("background", [False, True])
+def test_what_explains_segments_is_said_by_the_other_views_alone(background: bool) -> None:
+    views = drawn_views(2, 5, background)
+    objects, dense = drawn_objects(views)
+    stack = Stack(views)
+    weights = stack.weights().T.tocsr()
+    entries, numbers = (weights.indptr, weights.indices, weights.data), np.concatenate(objects)
+    own = by_view(*entries, stack.starts, *stack.gaussians())
+    best, known = explain_segments(own, *add_objects(*entries, numbers, 12), numbers, 12)
+    for view, of_view, part in zip(views, objects, stack.starts, strict=False):
+        common, expected = explained_densely(dense, view, of_view)
+        rows = slice(part, part + len(view))
+        np.testing.assert_allclose(known[rows], expected, rtol=1e-9, atol=1e-9)
+        np.testing.assert_array_equal(best[rows], best_of(common, expected))
+    assert len(set(best.tolist())) > 6
+
+
+def test_the_weights_of_each_view_come_by_gaussian() -> None:
+    views = drawn_views(3, 4, False)
+    stack = Stack(views)
+    weights = stack.weights().T.tocsr()
+    own = by_view(weights.indptr, weights.indices, weights.data, stack.starts, *stack.gaussians())
+    for v, view in enumerate(stack.views):
+        first, last = own.firsts[v : v + 2]
+        part = slice(own.indptr[first], own.indptr[last])
+        transposed = view.weights.T.tocsr()
+        np.testing.assert_array_equal(own.indptr[first : last + 1] - own.indptr[first], transposed.indptr)
+        np.testing.assert_array_equal(own.segments[part] - stack.starts[v], transposed.indices)
+        np.testing.assert_array_equal(own.weights[part], transposed.data)
+
+
+def test_a_segment_that_no_other_view_knows_of_is_explained_by_nothing() -> None:
+    alone, other = (Lifted(np.ones(1, np.int32), np.arange(n, n + 2, dtype=np.int32), WEIGHTS) for n in (0, 2))
+    assert associate({"alone": alone, "other": other}).objects == {"alone": [1], "other": [2]}
