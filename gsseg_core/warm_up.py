@@ -25,9 +25,8 @@ from gsseg_core.learn.em.em_learner import EMLearner, EMSettings
 from gsseg_core.learn.mask_reliability import compare_mask
 from gsseg_core.learn.vote_learner import VoteLearner
 from gsseg_core.learn.vote_resolution import resolved_votes
-from gsseg_core.objects import association_kernels, move_kernels
+from gsseg_core.objects import association_kernels, move_kernels, tree_kernels
 from gsseg_core.objects.clicks import merge_tree
-from gsseg_core.objects.column_products import column_products
 from gsseg_core.objects.heaviest import heaviest
 from gsseg_core.raster.backends import make_operator
 from gsseg_core.raster.cpu.occlusion import ray_ends
@@ -168,7 +167,7 @@ def refine_something(device: str = "cpu") -> None:
     merge_tree(labels[..., None])  # as for points in a view
     association_kernels.call_all()  # as for ids of each view's own
     move_kernels.call_all()
-    column_products(np.eye(2), np.arange(2))  # as for parts of objects
+    tree_kernels.call_all()  # as for parts of objects
     share = np.clip(0.5 + scene.means[:, 0], 0.05, 0.95)  # Unsure in the middle, where neighbours decide.
     codes = np.stack([1 - share, share], axis=1).astype(np.float32)
     propagate(graph_of(scene), codes, np.zeros(len(codes)))

@@ -29,8 +29,8 @@ from scipy import sparse
 
 from gsseg_core.data.object_tree import ObjectTree
 from gsseg_core.objects.association import AssociationSettings
-from gsseg_core.objects.column_products import column_products
 from gsseg_core.objects.lifted_segments import Lifted, sums
+from gsseg_core.objects.tree_kernels import Merged, Sight, cells, merge_regions, showing, staying
 from gsseg_core.spatial.row_order import rows_by_label
 
 SEVERAL = 3  # views that have to show a part or a whole
@@ -73,11 +73,13 @@ def grow_tree(
     members = [of_class.get(k, nobody) for k in range(num_classes)]
     for k in range(1, num_classes):
         rows, own = segments.on(members[k])
-        regions, shares = _regions(means[members[k]], rows, own)
-        tops = _kept(regions, own.showing(regions, shares))
+        merged = _regions(means[members[k]], rows, own)
+        tops = _kept(merged, own.showing(merged))
         found = _stepped(tops[0] if len(tops) == 1 else _Region(0.0, tops), level, 1.0)
         if found.parts:
-            places[members[k]] = _nearest_part(means[members[k]], rows, own, shares[[r.row for r in found.leaves()]])
+            places[members[k]] = _nearest_part(
+                means[members[k]], rows, own, merged.shares[[r.row for r in found.leaves()]]
+            )
             objects[k] = found
     for k, object_ in enumerate(objects):
         leaves = object_.leaves()
@@ -121,36 +123,15 @@ class _Segments:
     def _firsts(self) -> np.ndarray:
         return np.flatnonzero(np.diff(self.view, prepend=-1))
 
-    def votes(self, regions: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Shares of regions (R, S) that each view's ids have, as far as the view counts, and how far, (R, views)."""
-        seen = self.seen(regions)
-        counts = self.settings.sight(seen, seen.max(axis=1, keepdims=True, initial=0))
-        return regions * (counts / np.maximum(seen, 1e-9))[:, self.view], counts
-
-    def showing(self, regions: Sequence[_Region], shares: np.ndarray) -> np.ndarray:
-        """Which views show each region as a segment, (R, views) bool, given the shares (R, S) of all regions.
-
-        A segment is one region of those that hold each other: the one that fits it best, the larger one if both do.
-        """
-        if not len(self.view):
-            return np.zeros((len(regions), 0), bool)
-        seen = self.seen(shares)
-        overlap = seen[:, self.view]
-        overlap += self.size
-        overlap -= shares
-        np.divide(shares, np.maximum(overlap, 1e-9, out=overlap), out=overlap)
-        fits = overlap > _ITSELF
-        for region in regions:
-            for part in region.parts:
-                fits[part.row] &= overlap[part.row] > overlap[region.row]
-                fits[region.row] &= overlap[region.row] >= overlap[part.row]
-        return np.logical_or.reduceat(fits, self._firsts, axis=1) & (seen >= self.settings.full_sight_px)
+    def showing(self, merged: Merged) -> np.ndarray:
+        """Which views show each region as a segment, (R, views) bool."""
+        return showing(merged.parts, merged.shares, self.view, self.size, _ITSELF, float(self.settings.full_sight_px))
 
 
-def _regions(means: np.ndarray, rows: sparse.csr_matrix, segments: _Segments) -> tuple[list[_Region], np.ndarray]:
-    """Merge the cells of an object: all regions on the way, parts before wholes, and their shares (R, S)."""
+def _regions(means: np.ndarray, rows: sparse.csr_matrix, segments: _Segments) -> Merged:
+    """Merge the cells of an object: all regions on the way, parts before wholes."""
     seen = np.flatnonzero(np.diff(rows.indptr))
-    cell = _cells(means[seen], max(_CELL, len(seen) / _MOST_CELLS))
+    cell = cells(means[seen], max(float(_CELL), len(seen) / _MOST_CELLS))
     return _merge(_summed(rows[seen], cell), segments)
 
 
@@ -161,77 +142,24 @@ def _summed(rows: sparse.csr_matrix, groups: np.ndarray) -> np.ndarray:
     return np.asarray((grouping @ rows).toarray())
 
 
-def _cells(points: np.ndarray, size: float) -> np.ndarray:
-    """Group points (n, 3) by halving the longer side of their box until groups are of this size at most, (n,)."""
-    cell, parts, count = np.zeros(len(points), np.int64), [np.arange(len(points))], 0
-    while parts:
-        part = parts.pop()
-        if len(part) <= size:
-            cell[part], count = count, count + 1
-            continue
-        own = points[part]
-        order = part[np.argsort(own[:, np.ptp(own, axis=0).argmax()], kind="stable")]
-        parts += [order[: len(order) // 2], order[len(order) // 2 :]]
-    return cell
+def _merge(shares: np.ndarray, segments: _Segments) -> Merged:
+    """Merge regions (R, S), in every round those that agree with each other more than with any third."""
+    settings = segments.settings
+    return merge_regions(shares, segments.view, Sight(*(float(getattr(settings, name)) for name in Sight._fields)))
 
 
-def _merge(shares: np.ndarray, segments: _Segments) -> tuple[list[_Region], np.ndarray]:
-    """Merge regions (R, S), in every round those that agree with each other more than with any third.
-
-    Returns all regions that there were, parts before what is made of them, and the shares of each, (regions, S).
-    """
-    settings, regions, every = segments.settings, [_Region(row=row) for row in range(len(shares))], [shares]
-    shares, at = shares.copy(), np.arange(len(shares))  # what is left, each in the place of its first region
-    votes, counts = (columns.T.copy() for columns in segments.votes(shares))  # (S, R) and (views, R)
-
-    def agreement(rows: np.ndarray) -> np.ndarray:
-        both = column_products(counts, rows)
-        agreed: np.ndarray = column_products(votes, rows) / (both + settings.doubt)
-        agreed[both < settings.evidence] = 0
-        agreed[np.arange(len(rows)), rows] = 0
-        return agreed
-
-    agreed, left = agreement(at), np.ones(len(at), bool)
-    while len(at):
-        if 2 * np.count_nonzero(left) < len(left):  # What has merged into others costs nothing any more.
-            at, shares, agreed = at[left], shares[left], agreed[np.ix_(left, left)]
-            votes, counts = votes.compress(left, axis=1), counts.compress(left, axis=1)
-            left = np.ones(len(at), bool)
-        places, best = np.arange(len(at)), agreed.argmax(axis=1)
-        first = np.flatnonzero((best[best] == places) & (best > places) & (agreed[places, best] > 0))
-        if not len(first):
-            break
-        second = best[first]
-        left[second] = False
-        for a, b, by in zip(at[first], at[second], agreed[first, second].tolist(), strict=True):
-            regions.append(_Region(by, [regions[a], regions[b]], len(regions)))
-        at[first] = np.arange(len(regions) - len(first), len(regions))
-        shares[first] += shares[second]
-        every.append(shares[first])
-        votes[:, first], counts[:, first] = (columns.T for columns in segments.votes(shares[first]))
-        votes[:, second], counts[:, second], agreed[second], agreed[:, second] = 0, 0, 0, 0
-        agreed[first] = agreement(first)
-        agreed[:, first] = agreed[first].T
-    return regions, np.concatenate(every)
-
-
-def _kept(regions: Sequence[_Region], showing: np.ndarray, objects: Sequence[_Region] = ()) -> list[_Region]:
+def _kept(merged: Merged, shown: np.ndarray, objects: Sequence[_Region] = ()) -> list[_Region]:
     """Keep of all regions what several views show; `objects`, for the first regions, are kept in any case."""
-    sets = [int.from_bytes(row.tobytes(), "big") for row in np.packbits(showing, axis=1)]  # of views, a bit for each
-    kept, waiting = dict[int, list[_Region]](), dict[int, int]()
-    for region in regions:
-        found = [(kept.pop(part.row), waiting.pop(part.row)) for part in region.parts]
-        parts, views = [one for each, _ in found for one in each], sets[region.row]
-        alive = [few for each, few in found if each or few]
-        if len(alive) == 1:  # Then it is the same but for a rim, and views that show the one mean the other as well.
-            views |= alive[0]
-        if region.row < len(objects):
-            kept[region.row], waiting[region.row] = [objects[region.row]], 0
-        elif views.bit_count() < SEVERAL:
-            kept[region.row], waiting[region.row] = parts, views
-        else:
-            same = parts[0] if len(parts) == 1 else _Region(region.agreement if parts else 1.0, parts)
-            kept[region.row], waiting[region.row] = [_Region(same.agreement, same.parts, region.row)], 0
+    stays, kept = staying(merged.parts, shown, len(objects), SEVERAL), dict[int, list[_Region]]()
+    pairs = zip(merged.parts.tolist(), merged.agreement.tolist(), stays.tolist(), strict=True)
+    for row, (two, agreement, itself) in enumerate(pairs):
+        parts = [one for part in two if part >= 0 for one in kept.pop(part)]
+        if row < len(objects):
+            parts = [objects[row]]
+        elif itself:
+            same = parts[0] if len(parts) == 1 else _Region(agreement if parts else 1.0, parts)
+            parts = [_Region(same.agreement, same.parts, row)]
+        kept[row] = parts
     return [region for each in kept.values() for region in each]
 
 
@@ -267,8 +195,8 @@ def _wholes(
     present = [k for k in range(1, len(objects)) if len(members[k])]
     groups, where = np.concatenate([[], *(np.full(len(members[k]), i) for i, k in enumerate(present))]), members[1:]
     shares = _summed(segments.weights[np.concatenate([[], *where]).astype(np.int64)], groups.astype(np.int64))
-    regions, shares = _merge(shares, segments)
-    tops = _kept(regions, segments.showing(regions, shares), [_Region(row=k) for k in present])
+    merged = _merge(shares, segments)
+    tops = _kept(merged, segments.showing(merged), [_Region(row=k) for k in present])
     below = float(np.nextafter(np.float32(level), np.float32(0)))
     todo, found = [_stepped(region, 0.0, below) for region in tops], list[_Region]()
     while todo:  # What hardly a view has under one id is no whole.

@@ -25,7 +25,8 @@ from gsseg_core.learn.vote_learner import VoteLearner
 from gsseg_core.objects.association import AssociationSettings
 from gsseg_core.objects.lifted_segments import Lifted
 from gsseg_core.objects.object_table import ObjectTable, find_objects, object_name
-from gsseg_core.objects.tree_growing import _merge, _Segments, grow_tree
+from gsseg_core.objects.tree_growing import SEVERAL, _kept, _merge, _Region, _Segments, grow_tree
+from gsseg_core.objects.tree_kernels import Merged, cells
 from gsseg_core.raster.backends import make_operator
 from gsseg_core.refine.settings import UNREFINED
 from gsseg_core.scene.gaussian_scene import GaussianScene
@@ -39,6 +40,13 @@ def grown(views: Sequence[View], level: float = 0.4) -> ObjectTree:
     return grow_tree(SCENE.means, TRUTH, NUM_CLASSES, lifted, level)
 
 
+def votes_of(regions: np.ndarray, segments: _Segments) -> tuple[np.ndarray, np.ndarray]:
+    """Shares of regions (R, S) that each view's ids have, as far as the view counts, and how far, (R, views)."""
+    seen = segments.seen(regions)
+    counts = segments.settings.sight(seen, seen.max(axis=1, keepdims=True, initial=0))
+    return regions * (counts / np.maximum(seen, 1e-9))[:, segments.view], counts
+
+
 def merged_slowly(shares: np.ndarray, segments: _Segments) -> tuple[list[tuple[int, int, float]], np.ndarray]:
     """Regions that merge, and how much they agree, and the shares of all: every round measures every pair anew."""
     settings, left, every, merges = (
@@ -48,7 +56,7 @@ def merged_slowly(shares: np.ndarray, segments: _Segments) -> tuple[list[tuple[i
         list[tuple[int, int, float]](),
     )
     while True:
-        votes, counts = segments.votes(np.array([every[region] for region in left]))
+        votes, counts = votes_of(np.array([every[region] for region in left]), segments)
         both = sparse.csr_matrix(counts) @ counts.T
         agreed = sparse.csr_matrix(votes) @ votes.T / (both + settings.doubt)
         agreed[both < settings.evidence] = 0
@@ -74,10 +82,81 @@ def test_regions_merge_bit_for_bit_as_when_all_pairs_are_measured_in_every_round
     shares = rng.integers(0, 60, (count, len(view))) * (rng.random((count, len(view))) < 2 / ids) * 1.0
     settings = AssociationSettings()
     segments = _Segments(sparse.csr_matrix(shares), view, shares.sum(axis=0), settings)
-    regions, found = _merge(shares, segments)
+    merged = _merge(shares, segments)
     merges, expected = merged_slowly(shares, segments)
-    assert [(*(part.row for part in r.parts), r.agreement) for r in regions[count:]] == merges
-    np.testing.assert_array_equal(found, expected)
+    assert [(*two, by) for two, by in zip(merged.parts.tolist(), merged.agreement.tolist(), strict=True)][
+        count:
+    ] == merges
+    assert (merged.parts[:count] == -1).all()
+    np.testing.assert_array_equal(merged.shares, expected)
+
+
+def shown_slowly(merged: Merged, segments: _Segments) -> np.ndarray:
+    """Which views show each region, (R, views), one region after another: the twin of `_Segments.showing`."""
+    seen = segments.seen(merged.shares)
+    iou = merged.shares / np.maximum(seen[:, segments.view] + segments.size - merged.shares, 1e-9)
+    fits = iou > 0.5
+    for region, two in enumerate(merged.parts.tolist()):
+        for part in two if two[0] >= 0 else []:
+            fits[part] &= iou[part] > iou[region]
+            fits[region] &= iou[region] >= iou[part]
+    of_view = segments.view == np.arange(seen.shape[1])[:, None]
+    return (fits[:, None] & of_view).any(axis=2) & (seen >= segments.settings.full_sight_px)
+
+
+def kept_slowly(merged: Merged, shown: np.ndarray, objects: Sequence[_Region]) -> list[_Region]:
+    """What is kept of all regions, with the views that show them as sets: the twin of `_kept`."""
+    kept, waiting = dict[int, list[_Region]](), dict[int, set[int]]()
+    for row, two in enumerate(merged.parts.tolist()):
+        found = [(kept.pop(part), waiting.pop(part)) for part in two if part >= 0]
+        parts, views = [one for each, _ in found for one in each], set(np.flatnonzero(shown[row]).tolist())
+        alive = [few for each, few in found if each or few]
+        if len(alive) == 1:
+            views |= alive[0]
+        if row < len(objects):
+            kept[row], waiting[row] = [objects[row]], set()
+        elif len(views) < SEVERAL:
+            kept[row], waiting[row] = parts, views
+        else:
+            same = parts[0] if len(parts) == 1 else _Region(float(merged.agreement[row]) if parts else 1.0, parts)
+            kept[row], waiting[row] = [_Region(same.agreement, same.parts, row)], set()
+    return [region for each in kept.values() for region in each]
+
+
+def described(region: _Region) -> list[object]:
+    return [region.row, region.agreement, *map(described, region.parts)]
+
+
+@given(st.integers(1, 30), st.integers(1, 9), st.integers(1, 5), st.integers(0, 2**32 - 1), st.booleans())
+def test_regions_that_are_shown_and_kept_are_those_of_the_slow_twins(
+    count: int, views: int, ids: int, seed: int, certain: bool
+) -> None:
+    rng = np.random.default_rng(seed)
+    view = np.repeat(np.arange(views), ids)
+    owner = rng.integers(0, ids, (count, views))
+    shares = (owner[:, :, None] == np.arange(ids)).reshape(count, -1) * rng.integers(1, 60, (count, len(view))) * 1.0
+    segments = _Segments(sparse.csr_matrix(shares), view, shares.sum(axis=0), AssociationSettings())
+    merged = _merge(shares, segments)
+    shown = segments.showing(merged)
+    np.testing.assert_array_equal(shown, shown_slowly(merged, segments))
+    objects = [_Region(row=k) for k in range(count)] if certain else []
+    expected = kept_slowly(merged, shown, objects)
+    assert [described(region) for region in _kept(merged, shown.copy(), objects)] == [*map(described, expected)]
+
+
+@given(st.integers(0, 60), st.integers(0, 2**32 - 1), st.sampled_from([1.0, 2.5, 8.0]))
+def test_cells_are_halves_of_halves(count: int, seed: int, size: float) -> None:
+    points = np.random.default_rng(seed).integers(0, 5, (count, 3)).astype(np.float32)
+    cell, parts, number = np.zeros(count, np.int64), [np.arange(count)], 0
+    while parts:
+        part = parts.pop()
+        if len(part) <= size:
+            cell[part], number = number, number + 1
+            continue
+        own = points[part]
+        order = part[np.argsort(own[:, np.ptp(own, axis=0).argmax()], kind="stable")]
+        parts += [order[: len(order) // 2], order[len(order) // 2 :]]
+    np.testing.assert_array_equal(cells(points, size), cell)
 
 
 def test_an_object_that_some_views_cut_up_has_parts() -> None:
