@@ -17,7 +17,7 @@ import numba as nb
 import numpy as np
 import numpy.typing as npt
 
-from gsseg_core.csr_rows import CSRRows, slices
+from gsseg_core.csr_rows import CSRRows, slices, starts
 from gsseg_core.errors import GssegError, StateFileError, StateMismatchError
 from gsseg_core.files.atomic import write_atomically
 from gsseg_core.files.input_files import DAMAGED, open_input, reason
@@ -108,6 +108,25 @@ class NpzArrays:
                 parts.append(CSRRows.from_dense(np.frombuffer(bytearray(content), dtype).reshape(-1, num_columns)))
             _check_end(member, name)
         return CSRRows.vstack(parts)
+
+    def expect_sparse(self, name: str, dtype: npt.DTypeLike, shape: tuple[int, int]) -> CSRRows:
+        """Read the arrays that `sparse_arrays` has made of rows, none of whose entries is zero."""
+        num_rows, num_columns = shape
+        counts = self.expect(f"{name}_counts", np.uint16, (num_rows,))
+        if counts.max(initial=0) > num_columns:
+            raise UnfitError(f"array {name}_counts holds {counts.max()}; expected at most {num_columns}")
+        indptr = starts(counts.astype(np.int64))
+        indices = self.expect(f"{name}_indices", np.uint16, (int(indptr[-1]),))
+        if indices.max(initial=0) >= num_columns:
+            raise UnfitError(f"array {name}_indices holds {indices.max()}; expected below {num_columns}")
+        begins = np.zeros(len(indices) + 1, bool)
+        begins[indptr] = True
+        if not np.all((indices[1:] > indices[:-1]) | begins[1:-1]):
+            raise UnfitError(f"array {name}_indices does not rise in a row; expected ascending columns")
+        data = self.expect(f"{name}_data", dtype, indices.shape)
+        if not data.all():
+            raise UnfitError(f"array {name}_data holds 0; expected entries that are not zero only")
+        return CSRRows(indptr, indices.astype(np.uint32), data)
 
     def read(self, name: str) -> npt.NDArray[Any]:
         """Read an array, whose `header` the caller has checked."""
@@ -209,6 +228,16 @@ def check_evidence(px: npt.NDArray[np.float32], unfit: type[Exception] = UnfitEr
     if bad.size:
         found = f"array evidence holds {px[bad[0]]:g} in row {bad[0]} ({bad.size:,} of {len(px):,} rows are unusable)"
         raise unfit(f"{found}; expected finite numbers of px, 0 or more")
+
+
+def sparse_arrays(name: str, rows: CSRRows) -> dict[str, npt.NDArray[Any]]:
+    """Make arrays of those entries of N rows that are not zero: `{name}_counts`, `{name}_indices` and `{name}_data`.
+
+    Counts of each row, (N,) uint16, take half of the space of `indptr`, and cannot run backwards.
+    """
+    kept = rows.nonzero()
+    arrays = np.diff(kept.indptr).astype(np.uint16), kept.indices.astype(np.uint16), kept.data
+    return dict(zip((f"{name}_counts", f"{name}_indices", f"{name}_data"), arrays, strict=True))
 
 
 class WithZeros(NamedTuple):

@@ -1,5 +1,7 @@
 """What has been learnt of one scene, on disk: views with their masks, votes and codes, in one compressed npz.
 
+Of votes and codes, (N, K), only what is not zero is in the file (docs/conventions.md says how to read it with NumPy).
+
 The state of a scene that changes holds the geometry of the scene, too: votes can then be carried over to what the scene
 has become.
 """
@@ -27,13 +29,13 @@ from gsseg_core.files.limits import LIMITS, MAX_LABEL
 from gsseg_core.files.npz_files import (
     NpzArrays,
     UnfitError,
-    WithZeros,
     check_evidence,
     check_scene,
     check_shares,
     class_names_of,
     npz_format,
     open_npz,
+    sparse_arrays,
     temperature_of,
     whole_number,
     write_arrays,
@@ -44,10 +46,11 @@ from gsseg_core.scene.living_scene import LivingScene
 from gsseg_core.scene.scene_delta import MAX_ID
 from gsseg_core.text import clipped, quoted
 
-FORMAT, WHOLE_RAYS = "gsseg-state-2", "gsseg-state-1"
-"""What states say that they are: of this version; and of those whose rays went on behind surfaces."""
+FORMAT, WITH_ZEROS, WHOLE_RAYS = "gsseg-state-3", "gsseg-state-2", "gsseg-state-1"
+"""What states say that they are: of this version; of those that wrote votes and codes with all their zeros; and of
+those, older still, whose rays went on behind surfaces."""
 
-_FORMATS = FORMAT, WHOLE_RAYS
+_FORMATS = FORMAT, WITH_ZEROS, WHOLE_RAYS
 
 OBJECTS_OF_ONE_SESSION = "holds objects that its own session found and numbered (ids per-view)"
 """What errors say of a state with `per_view`, where classes are expected that mean the same to others."""
@@ -103,10 +106,8 @@ class State:
         """
         path = Path(path)
         check_replaceable(path, "saved state", npz_format(path) in _FORMATS)
-        counts = np.diff(self.votes.indptr)
-        seen = np.flatnonzero(counts)
         header: dict[str, Any] = {
-            "format": WHOLE_RAYS if self.whole_rays else FORMAT,
+            "format": FORMAT,
             "scene": digest,
             "shape": [self.votes.num_rows, self.num_classes],
             "views": [_entry(view) for view in self.views],
@@ -115,11 +116,12 @@ class State:
         }
         if self.per_view:
             header["ids"] = PER_VIEW
-        of_seen = self.votes._replace(indptr=starts(counts[seen]))
-        arrays: dict[str, Any] = {"seen": seen, "votes": WithZeros(of_seen, self.num_classes)}
+        if self.whole_rays:
+            header["whole_rays"] = True
+        arrays: dict[str, Any] = sparse_arrays("votes", self.votes)
         if self.learnt is not None:
             header["learnt"] = {name: getattr(self.learnt, name) for name in ("learner", "num_views", "temperature")}
-            arrays["codes"] = WithZeros(self.learnt.codes, self.num_classes)
+            arrays |= sparse_arrays("codes", self.learnt.codes)
             if self.learnt.evidence is not None:
                 arrays["evidence"] = self.learnt.evidence
         if self.living is not None:
@@ -195,13 +197,12 @@ class State:
         learnt = None
         if "learnt" in header:
             entry = header["learnt"]
-            codes = file.expect_rows("codes", np.float32, (n, None))
-            if not 1 <= (found := file.header("codes").shape[1]) <= k:
-                raise UnfitError(f"array codes is of {found} classes; expected 1 to {k}")
+            codes = _read_codes(file, (n, k))
             check_shares("codes", codes)
             num_views = whole_number(entry["num_views"], "num_views of what was learnt", 0, _MOST_VIEWS)
             learnt = Learnt(str(entry["learner"]), codes, num_views, temperature_of(entry), _read_evidence(file, n))
-        names, per_view, whole = class_names_of(header), header.get("ids") == PER_VIEW, header["format"] == WHOLE_RAYS
+        names, per_view = class_names_of(header), header.get("ids") == PER_VIEW
+        whole = header["format"] == WHOLE_RAYS or header.get("whole_rays") is True
         return cls(votes, k, views, num_fused, names, learnt, living, per_view, whole)
 
 
@@ -212,25 +213,41 @@ def _entry(view: View) -> dict[str, Any]:
 
 def _read_votes(file: NpzArrays, shape: tuple[int, int], num_kept: int, num_fused: int) -> CSRRows:
     """Read votes, N rows of int64; of a Gaussian they cannot be more than the pixels of all views."""
-    seen = file.expect("seen", np.int64, (None,))
-    if np.any(np.diff(seen) <= 0) or np.any((seen < 0) | (seen >= shape[0])):
-        raise UnfitError(f"array seen holds no Gaussians; expected ascending numbers from 0 to {shape[0] - 1}")
-    given = file.expect_rows("votes", np.int64, (len(seen), shape[1]))
+    older = "votes" in file.names
+    given = _read_votes_with_zeros(file, shape) if older else file.expect_sparse("votes", np.int64, shape)
     # Only masks that tell what is not there vote against a class; of views that were not kept, nobody knows.
     may_oppose = num_fused > num_kept or any(name.startswith("supervised_") for name in file.names)
     if not may_oppose and given.data.min(initial=0) < 0:
         raise UnfitError(f"array votes holds {given.data.min()}; expected none below 0")
-    counts = np.diff(given.indptr)
-    rows = np.repeat(np.arange(len(seen)), counts)
+    rows = np.repeat(np.arange(shape[0]), np.diff(given.indptr))
     most = np.bincount(rows, np.abs(given.data, dtype=np.float64)).max(initial=0)
     possible = min(num_fused * _VIEW_VOTES * (shape[1] if may_oppose else 1), _MOST_VOTES)
     if most > possible:
         raise UnfitError(
             f"array votes sums to {most:.3g} in a row; expected at most {possible:.3g} of {num_fused} views"
         )
+    return given
+
+
+def _read_votes_with_zeros(file: NpzArrays, shape: tuple[int, int]) -> CSRRows:
+    """Read votes as an older version wrote them: of the Gaussians that have any, with all zeros."""
+    seen = file.expect("seen", np.int64, (None,))
+    if np.any(np.diff(seen) <= 0) or np.any((seen < 0) | (seen >= shape[0])):
+        raise UnfitError(f"array seen holds no Gaussians; expected ascending numbers from 0 to {shape[0] - 1}")
+    given = file.expect_rows("votes", np.int64, (len(seen), shape[1]))
     of_all = np.zeros(shape[0], np.int64)
-    of_all[seen] = counts
+    of_all[seen] = np.diff(given.indptr)
     return given._replace(indptr=starts(of_all))
+
+
+def _read_codes(file: NpzArrays, shape: tuple[int, int]) -> CSRRows:
+    """Read class probabilities, N rows of float32; an older version wrote them with all zeros."""
+    if "codes" not in file.names:
+        return file.expect_sparse("codes", np.float32, shape)
+    codes = file.expect_rows("codes", np.float32, (shape[0], None))
+    if not 1 <= (found := file.header("codes").shape[1]) <= shape[1]:
+        raise UnfitError(f"array codes is of {found} classes; expected 1 to {shape[1]}")
+    return codes
 
 
 def _read_evidence(file: NpzArrays, num_gaussians: int) -> np.ndarray | None:

@@ -178,6 +178,69 @@ def test_a_state_that_no_session_could_have_is_refused(
     assert_refused_in_little_memory(lambda: State.load(state, SCENE.digest, N), StateFileError, str(state), part)
 
 
+def one_vote(count: int = 1, column: int = 0, vote: Any = 9) -> dict[str, Any]:
+    """Make sparse arrays of votes of the first Gaussian, all for one class."""
+    counts = np.zeros(N, np.uint16)
+    counts[0] = count
+    return {
+        "votes_counts": counts, "votes_indices": np.full(count, column, np.uint16),
+        "votes_data": np.full(count, vote, np.int64 if isinstance(vote, int) else None),
+    }  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    ("arrays", "part"),
+    [
+        (one_vote(vote=-5), "array votes holds -5"), (one_vote(vote=2**62), "array votes sums to"),
+        (one_vote(vote=np.nan), "array votes_data is float64"), (one_vote(vote=0), "array votes_data holds 0"),
+        (one_vote(column=NUM_CLASSES), "array votes_indices holds 4; expected below 4"),
+        (one_vote(column=65535), "array votes_indices holds 65535"),
+        (one_vote(2), "array votes_indices does not rise in a row"),
+        (one_vote(5), "array votes_counts holds 5; expected at most 4"),
+        (one_vote() | {"votes_indices": np.array([2, 1], np.uint16)}, "shape (2,); expected uint16 of shape (1,)"),
+        (one_vote(2) | {"votes_indices": np.array([2, 1], np.uint16)}, "array votes_indices does not rise in a row"),
+        (one_vote() | {"votes_indices": np.array([-1])}, "array votes_indices is int64"),
+        (one_vote() | {"votes_data": np.ones(2, np.int64)}, "array votes_data is int64 of shape (2,)"),
+        (one_vote() | {"votes_data": np.ones((1, 1), np.int64)}, "array votes_data is int64 of shape (1, 1)"),
+        ({"votes_counts": np.full(N, 65535, np.uint16)}, "array votes_counts holds 65535"),
+        ({"votes_counts": np.full(N, -1)}, "array votes_counts is int64"),
+        ({"votes_counts": np.zeros(N + 1, np.uint16)}, "array votes_counts is uint16 of shape (627,)"),
+        ({"votes_counts": np.zeros(N, np.uint16)}, "array votes_indices is uint16"),
+        ({"votes_counts": None}, "there is no array 'votes_counts'"), ({"votes_data": None}, "no array 'votes_data'"),
+    ],
+)  # fmt: skip
+def test_sparse_votes_that_are_no_rows_of_votes_are_refused(state: Path, arrays: dict[str, Any], part: str) -> None:
+    rewritten(state, **arrays)
+    assert_refused_in_little_memory(lambda: State.load(state, SCENE.digest, N), StateFileError, str(state), part)
+    assert_refused_in_little_memory(lambda: State.load_alone(state), StateFileError, str(state), part)
+
+
+@pytest.mark.parametrize("entry", [np.nan, -1.0, 0.5, np.inf])
+def test_sparse_codes_that_are_no_probabilities_are_refused(state: Path, entry: float) -> None:
+    codes = {"codes_counts": np.ones(N, np.uint16), "codes_indices": np.zeros(N, np.uint16)}
+    header = {"learnt": {"learner": "em", "num_views": 2}}
+    rewritten(state, header, **codes, codes_data=np.full(N, entry, np.float32))
+    assert_refused_in_little_memory(lambda: State.load(state, SCENE.digest, N), StateFileError, "array codes")
+    rewritten(state, header, codes_data=np.ones(N, np.float32))
+    assert len(State.load(state, SCENE.digest, N).learnt.codes.data) == N
+
+
+@pytest.mark.parametrize(
+    ("name", "dtype"), [("votes_counts", np.uint16), ("votes_indices", np.uint16), ("votes_data", np.int64)]
+)
+def test_votes_that_would_inflate_to_more_than_the_scene_explains_are_not_inflated(
+    state: Path, name: str, dtype: Any
+) -> None:
+    with np.load(state) as file:
+        shape = file[name].shape
+    with_bomb(state, name, (1 << 24,), dtype)
+    assert_refused_in_little_memory(lambda: State.load(state, SCENE.digest, N), StateFileError, f"array {name} is")
+    with_bomb(state, name, shape, dtype)
+    assert_refused_in_little_memory(
+        lambda: State.load(state, SCENE.digest, N), StateFileError, "longer than its header"
+    )
+
+
 def test_two_views_of_one_name_are_refused_since_one_would_be_lost(state: Path) -> None:
     rewritten(state, {"views": [{"name": "a", "size": [WIDTH, HEIGHT]}] * 2})
     assert_refused_in_little_memory(lambda: State.load(state, SCENE.digest, N), StateFileError, "two views", "'a'")

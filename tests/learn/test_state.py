@@ -2,18 +2,24 @@
 
 from __future__ import annotations
 
+import json
 import os
+import zipfile
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
+from scipy import sparse
 from small_scenes import NUM_CLASSES, balls_on_a_table, clean_views, taught
 
+from gsseg_core.csr_rows import starts
 from gsseg_core.errors import PathTakenError, StateFileError, StateMismatchError, WriteError
 from gsseg_core.learn import learner_state as state_file
 from gsseg_core.learn.learner import Learner
-from gsseg_core.learn.learner_state import State
+from gsseg_core.learn.learner_state import Learnt, State
 from gsseg_core.learn.vote_learner import VoteLearner
+from gsseg_core.live.session import LiveSession
 
 SCENE, TRUTH = balls_on_a_table()
 VIEWS = clean_views(3)
@@ -64,6 +70,71 @@ def test_a_saved_state_comes_back_exactly_and_can_be_added_to_and_taken_from(sav
     for view in (VIEWS[0], VIEWS[2]):
         restored.retract(view.name)
     assert not restored._votes.dense().any()
+
+
+def as_older(path: Path, kind: str) -> Path:
+    """Write a state as older versions did: votes and codes with all their zeros."""
+    with np.load(path) as file:
+        arrays = dict(file)
+    header = json.loads(str(arrays.pop("header"))) | {"format": kind}
+    n, k = header["shape"]
+    for name in ("votes", "codes"):
+        counts, indices, data = (arrays.pop(f"{name}_{part}") for part in ("counts", "indices", "data"))
+        arrays[name] = sparse.csr_array((data, indices, starts(counts.astype(int))), shape=(n, k)).toarray()
+    arrays["seen"] = np.flatnonzero(arrays["votes"].any(axis=1))
+    arrays["votes"] = arrays["votes"][arrays["seen"]]
+    older = path.with_name(f"{kind}.npz")
+    np.savez_compressed(older, header=np.array(json.dumps(header)), **arrays)
+    return older
+
+
+@pytest.mark.parametrize("kind", [state_file.WITH_ZEROS, state_file.WHOLE_RAYS])
+def test_states_of_older_versions_with_all_their_zeros_are_the_same_states(tmp_path: Path, kind: str) -> None:
+    path, learner = tmp_path / "state.npz", taught(fresh(), VIEWS).fit()
+    codes = learner.code_rows_.only(np.arange(len(SCENE)) % 3 > 0)
+    learnt = Learnt("em", codes, len(VIEWS), 2.0, learner.evidence())
+    replace(learner.state(), learnt=learnt).save(path, SCENE.digest)
+    found = State.load(path, SCENE.digest, len(SCENE))
+    older = State.load(as_older(path, kind), SCENE.digest, len(SCENE))
+    for wanted, *given in (
+        (learner.state().votes, found.votes, older.votes), (codes, found.learnt.codes, older.learnt.codes),
+    ):  # fmt: skip
+        for rows in given:
+            for one, other in zip(rows, wanted, strict=True):
+                np.testing.assert_array_equal(one, other)
+                assert one.dtype == other.dtype
+    assert (found.whole_rays, older.whole_rays) == (False, kind == state_file.WHOLE_RAYS)
+    assert found.num_fused == older.num_fused == 3 and [view.name for view in older.views] == [*learner.views]
+    older.save(path, SCENE.digest)
+    again = State.load(path, SCENE.digest, len(SCENE))
+    assert again.whole_rays == older.whole_rays, "votes of whole rays stay so until a session casts them anew"
+    session = LiveSession(SCENE)
+    session.load(path)
+    np.testing.assert_array_equal(session._live._votes.dense(), learner._votes.dense())
+
+
+def test_a_state_takes_room_for_what_is_not_zero_and_numpy_and_scipy_read_it(tmp_path: Path) -> None:
+    votes, k = taught(fresh(), VIEWS).state().votes, 5000
+    State(votes, k, [], len(VIEWS)).save(tmp_path / "state.npz", SCENE.digest)
+    with np.load(tmp_path / "state.npz") as file:
+        indptr = np.append(0, np.cumsum(file["votes_counts"], dtype=int))
+        read = sparse.csr_array((file["votes_data"], file["votes_indices"], indptr), shape=(len(SCENE), k))
+    np.testing.assert_array_equal(read.toarray(), votes.dense(k))
+    with zipfile.ZipFile(tmp_path / "state.npz") as file:
+        assert sum(member.file_size for member in file.infolist()) < 12 * len(votes.data) + 2 * len(SCENE) + 4000
+
+
+def test_a_state_whose_rows_are_broken_is_refused_and_changes_nothing(saved: Path) -> None:
+    with np.load(saved) as file:
+        arrays = dict(file)
+    learner = taught(fresh(), VIEWS[:1])
+    for name, broken in (
+        ("votes_counts", np.roll(arrays["votes_counts"], 1)[:-1]), ("votes_indices", arrays["votes_indices"] + 4),
+        ("votes_indices", arrays["votes_indices"][::-1]), ("votes_data", -arrays["votes_data"]),
+        ("votes_data", arrays["votes_data"] * 0.5), ("votes_data", arrays["votes_data"][:-1]),
+    ):  # fmt: skip
+        np.savez(saved, **{**arrays, name: broken})
+        assert_refused(learner, saved, StateFileError)
 
 
 def test_a_learner_without_views_can_be_saved_and_restored(tmp_path: Path) -> None:
