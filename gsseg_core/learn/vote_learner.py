@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 
 from gsseg_core.data.view import View
-from gsseg_core.learn.learner import Learner, Progress, silent
+from gsseg_core.learn.learner import UNITS, Learner, Progress, silent
 from gsseg_core.learn.usable_views import read_mask
 from gsseg_core.scene.camera import Camera
 
@@ -38,6 +38,18 @@ class VoteLearner(Learner):
         self._lift(before, seen, -1)
         self.views[name] = after
         self._prepared.drop(name)
+
+    def relabel(self, view: View) -> None:
+        """Have a view show other labels, seen from where it is: its operator is made once for both.
+
+        On any error, nothing has changed.
+        """
+        before, view = self._observed(view.name), view.held()
+        masks, operator = [read_mask(each, self.num_classes) for each in (view, before)], self._operator_of(view)
+        for mask, sign in zip(masks, (1, -1), strict=True):
+            operator.vote(*self._used_labels(mask, operator), self._votes, UNITS, sign)
+        self.views[view.name] = view
+        self._prepared.drop(view.name)
 
     def predict_without(self, view: View) -> np.ndarray:
         """Blend into a view the votes of all others as probabilities, (H, W, K) float32; exact, by subtraction."""

@@ -96,12 +96,15 @@ class PerViewSession(LiveSession):
             except GssegError:
                 undo()
                 raise
-            for name in names:
-                self._live.retract(name)
-            if moved and forgotten:
+            if moved and forgotten:  # What is left once the views have gone is of those that are no longer kept.
+                for name in names:
+                    self._live.retract(name)
                 self._live.adopt(_with_numbers(self._live.state(), repair.successors))
-            for view in views.values():
-                self._live.observe(view)
+                for view in views.values():
+                    self._live.observe(view)
+            else:
+                for view in views.values():
+                    self._live.relabel(view)
             # The oldest view still is the first one to go.
             self._live.views = {name: self._live.views[name] for name in every if name in self._live.views}
             if moved:

@@ -178,12 +178,12 @@ def _nearest_part(
     means: np.ndarray, rows: sparse.csr_matrix, segments: _Segments, parts: np.ndarray
 ) -> np.ndarray:  # (n,) index of a part
     """Give each Gaussian of an object to one of its parts (P, S), by the ids on it or else by its neighbour's."""
-    from scipy.spatial import cKDTree
-
     shares = parts / np.maximum(segments.seen(parts), 1e-9)[:, segments.view]
     place = np.asarray((rows @ shares.T).argmax(axis=1))
     seen = np.diff(rows.indptr) > 0
     if not seen.all():
+        from scipy.spatial import cKDTree  # It takes a while to load.
+
         place[~seen] = place[seen][cKDTree(means[seen]).query(means[~seen])[1]]
     return place
 

@@ -94,6 +94,26 @@ def test_a_view_that_cannot_be_moved_keeps_its_votes_and_its_camera() -> None:
     assert learner.views[view.name] is view
 
 
+@pytest.mark.parametrize("memory_budget", [None, 0])
+def test_a_view_with_other_labels_has_their_votes_and_no_others(memory_budget: int | None) -> None:
+    others = [View.from_arrays(view.camera, np.roll(view.read_labels(), 9, axis=1)) for view in VIEWS[:2]]
+    learner, expected = (
+        taught(VoteLearner(SCENE, NUM_CLASSES, memory_budget=memory_budget), views)
+        for views in (VIEWS, [*others, *VIEWS[2:]])
+    )
+    for view in others:
+        learner.relabel(view)
+    np.testing.assert_array_equal(learner._votes.dense(), expected._votes.dense())
+    np.testing.assert_array_equal(learner.fit().codes_, expected.fit().codes_)
+    assert list(learner.views) == [view.name for view in VIEWS]
+    before = learner._votes.dense()
+    for mask in (np.full((48, 64), NUM_CLASSES, np.int32), np.zeros((48, 63), np.int32)):
+        with pytest.raises((UnknownLabelError, MaskSizeError)):
+            learner.relabel(View.from_arrays(VIEWS[0].camera, mask))
+    np.testing.assert_array_equal(learner._votes.dense(), before)
+    assert learner.views[VIEWS[0].name] is others[0]
+
+
 @pytest.mark.parametrize("weight", [0.0, 3.0])
 def test_neighbours_are_looked_for_beside_a_gpu_if_the_prior_asks_for_them(
     weight: float, monkeypatch: pytest.MonkeyPatch
@@ -318,6 +338,9 @@ def test_impossible_requests_are_refused() -> None:
     learner, state = VoteLearner(SCENE, 2), taught(VoteLearner(SCENE, NUM_CLASSES), VIEWS).state()
     with pytest.raises(StateMismatchError, match="state is of 626 Gaussians; expected 600, as the scene has"):
         EMLearner(SCENE.subset(np.arange(600)), NUM_CLASSES).adopt(state)
+    ghost = replace(VIEWS[0], camera=replace(VIEWS[0].camera, name="ghost"))
+    with pytest.raises(SettingsError, match="'ghost' was not observed"):
+        learner.relabel(ghost)
     for ask in (learner.retract, learner.forget, lambda name: learner.move(name, VIEWS[0].camera)):
         with pytest.raises(SettingsError, match="'ghost' was not observed"):
             ask("ghost")
