@@ -22,6 +22,7 @@ from gsseg_core.scene.gaussian_scene import GaussianScene
 from gsseg_core.segmentation import Segmentation
 from gsseg_core.several_at_once import several_at_once
 
+LEGEND_CLASSES = 1_000  # more than this are a vocabulary, most of which no scene has
 _DIFFERENT = np.array([[0, 0, 0], [230, 40, 40]], np.uint8)
 SavePicture = Callable[[Path, np.ndarray], object]  # writes a picture as `save_png` does, now or later
 _LONGEST_NAME = 255  # bytes of the name of a file, at most, on all file systems
@@ -120,14 +121,19 @@ def write_overview(
     folder: Path,
     save: SavePicture,
 ) -> list[Path]:
-    """Write `contact_sheet.png` of some pictures, if there are any, and `legend.png`."""
+    """Write `contact_sheet.png` of some pictures, if there are any, and `legend.png`.
+
+    Of more than `LEGEND_CLASSES` classes, as a vocabulary has, the legend shows those that Gaussians belong to.
+    """
     paths = []
     if images:
         paths.append(folder / "contact_sheet.png")
         save(paths[-1], contact_sheet(images, captions, 4))
     paths.append(folder / "legend.png")
-    colors = palette(result.num_classes)
-    save(paths[-1], legend(result.class_names, colors, result.counts()))
+    names, counts = result.class_names, result.counts()
+    if len(names) > LEGEND_CLASSES:
+        names = {k: name for k, name in names.items() if counts[k]}
+    save(paths[-1], legend(names, palette(result.num_classes), counts))
     return paths
 
 

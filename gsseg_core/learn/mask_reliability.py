@@ -84,6 +84,13 @@ class ViewCheck:
             predicted = np.where(unknown & ((predicted == UNKNOWN) | (beside == mask)), beside, predicted)
         return predicted
 
+    def cells(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """List the counts that are not 0: class predicted, label, which is a class, and pixels, (C,) int64 each."""
+        predicted, place = np.nonzero(self.counts)
+        labels = self.classes[place].astype(np.int64)
+        named = labels >= 0
+        return predicted[named], labels[named], self.counts[predicted[named], place[named]]
+
     def confusions(self, count: int = 3) -> list[tuple[int, int, float]]:
         """List what was most often taken for something else: class predicted, label seen, share of checked pixels."""
         wrong = self.counts.copy()
@@ -245,19 +252,39 @@ def compare_mask(
         expected = f"integers {UNKNOWN} to {num_classes - 1} of shape {labels.shape}"
         raise MaskFormatError(f"view '{view.name}': prediction is {found}; expected {expected}")
     width = int(max(labels.max(initial=-1), -1 if evidence is None else evidence.classes.max(initial=-1))) + 1
-    table = np.zeros((num_classes + 1, width + 2), np.int64)
-    _count_pixels(predicted, labels, seen.labels, table)
-    classes = np.flatnonzero(table[:, :width].any(axis=0)).astype(np.int32) if evidence is None else evidence.vocabulary
-    known = table[:, : width + 1 if evidence is not None and evidence.has_none_of_these else width]
-    counts = table[1:, np.where(classes >= 0, classes, width)]
+    (rows, row), (columns, column) = _occurring(predicted, num_classes), _occurring(labels, width)
+    table = np.zeros((len(rows) + 1, len(columns) + 2), np.int64)
+    _count_pixels(predicted, labels, seen.labels, row, column, table)
+    classes = columns.astype(np.int32) if evidence is None else evidence.vocabulary
+    known = table[:, : len(columns) + 1 if evidence is not None and evidence.has_none_of_these else len(columns)]
+    places = np.where(classes >= 0, column[classes], len(columns))
+    occurs = np.flatnonzero(places >= 0)
+    counts = np.zeros((num_classes, len(classes)), np.int64)
+    counts[np.ix_(rows, occurs)] = table[1:, places[occurs]]
     at_border = [np.concatenate([one[0], one[-1], one[:, 0], one[:, -1]]) for one in (labels, predicted)]
     cut = np.unique(at_border[0][(at_border[0] == at_border[1]) & (at_border[0] >= 0)])
     return ViewCheck(view.name, int(known.sum()), classes, counts, PackedLabels(predicted), evidence, cut=cut)
 
 
+def _occurring(labels: np.ndarray, count: int) -> tuple[np.ndarray, np.ndarray]:  # (H, W)
+    """Find which of `count` classes occur, (C,) ascending, and the place of each class among these, (count + 1,).
+
+    Those that do not have -1 for a place, and so has `UNKNOWN`, at last. A table of all names would take gigabytes
+    where there are tens of thousands.
+    """
+    occurs = np.zeros(count + 1, bool)
+    occurs[labels] = True
+    present = np.flatnonzero(occurs[:-1])
+    place = np.full(count + 1, UNKNOWN)
+    place[present] = np.arange(len(present))
+    return present, place
+
+
 @kernel
 def _count_pixels(
-    predicted: np.ndarray, labels: np.ndarray, seen: np.ndarray, table: np.ndarray  # (H, W) each; (K + 1, W + 2) out
+    predicted: np.ndarray, labels: np.ndarray, seen: np.ndarray,  # (H, W) each
+    row: np.ndarray, column: np.ndarray,  # (K + 1,), (W + 1,): place of each among those that occur
+    table: np.ndarray,  # (R + 1, C + 2) out
 ) -> None:  # fmt: skip
     """Count pixels by class predicted, the first row for none, and by label.
 
@@ -267,4 +294,4 @@ def _count_pixels(
     for y in range(labels.shape[0]):
         for x in range(labels.shape[1]):
             unnamed = width if seen[y, x] >= 0 else width + 1
-            table[predicted[y, x] + 1, labels[y, x] if labels[y, x] >= 0 else unnamed] += 1
+            table[row[predicted[y, x]] + 1, column[labels[y, x]] if labels[y, x] >= 0 else unnamed] += 1

@@ -32,16 +32,18 @@ class MaskChecks:
     views: Mapping[str, View]  # at least those
     held_out: bool  # whether a prediction comes from the other views alone; else also from the view itself
 
-    def confusion(self, num_classes: int) -> np.ndarray:
-        """Count pixels by class predicted (row) and label of the mask (column), over all views: (K, K) int64.
+    def confusion(self) -> tuple[np.ndarray, np.ndarray]:
+        """Count pixels by class predicted (row) and label of the mask (column), over all views.
 
-        "None of these" of a partial mask is no class, and is not counted.
+        Returns the classes that are in either, (C,) int64 ascending, and their counts, (C, C) int64: of tens of
+        thousands of names, few occur. "None of these" of a partial mask is no class, and is not counted.
         """
-        counts = np.zeros((num_classes, num_classes), np.int64)
-        for check in self.checks:
-            named = check.classes >= 0
-            counts[:, check.classes[named]] += check.counts[:, named]
-        return counts
+        cells = [check.cells() for check in self.checks]
+        rows, columns, counts = (np.concatenate(parts) for parts in zip(*cells, strict=True))
+        classes = np.union1d(rows, columns)
+        table = np.zeros((len(classes), len(classes)), np.int64)
+        np.add.at(table, (np.searchsorted(classes, rows), np.searchsorted(classes, columns)), counts)
+        return classes, table
 
     def views_showing(self, num_classes: int) -> np.ndarray:
         """Count the views that show each class, by what is predicted: (K,) int64."""
@@ -53,17 +55,17 @@ class MaskChecks:
 
 
 def class_ious(confusion: np.ndarray) -> np.ndarray:
-    """IoU of each class between prediction and masks, (K,) of (K, K) pixels; NaN for a class that is in neither."""
+    """IoU of each class between prediction and masks, (C,) of (C, C) pixels; NaN for a class that is in neither."""
     return iou(confusion.diagonal(), confusion.sum(axis=0), confusion.sum(axis=1))
 
 
 def largest_confusions(confusion: np.ndarray, count: int) -> list[tuple[int, int, int]]:
-    """List what was most often taken for something else in (K, K) pixels: class predicted, label of the mask, count."""
+    """List what was most often taken for something else in (C, C) pixels: class predicted, label of the mask, count."""
     return largest_cells(confusion - np.diag(confusion.diagonal()), count)
 
 
 def most_confused(confusion: np.ndarray, count: int) -> list[int]:
-    """Choose by (K, K) pixels the classes in most of which prediction and mask differ, `count` at most, by id."""
+    """Choose by (C, C) pixels the classes in most of which prediction and mask differ, `count` at most, by place."""
     wrong = confusion.sum(axis=0) + confusion.sum(axis=1) - 2 * confusion.diagonal()
     order = [int(k) for k in np.argsort(-wrong, kind="stable")[:count] if confusion[k].any() or confusion[:, k].any()]
     return sorted(order)

@@ -48,14 +48,22 @@ class PageInputs:
         return palette(self.segmentation.num_classes)
 
     @cached_property
-    def confusion(self) -> np.ndarray | None:
-        """Pixels by class predicted and label of the mask, (K, K) int64; None where no mask was checked."""
-        return self.checked.confusion(self.segmentation.num_classes) if self.checked.checks else None
+    def confusion(self) -> tuple[np.ndarray, np.ndarray] | None:
+        """Classes that occur, (C,), and pixels by class predicted and label of the mask, (C, C) int64.
+
+        None where no mask was checked.
+        """
+        return self.checked.confusion() if self.checked.checks else None
 
     @cached_property
     def ious(self) -> np.ndarray | None:
         """IoU of each class with the masks, (K,), NaN for a class that is nowhere; None where no mask was checked."""
-        return None if self.confusion is None else class_ious(self.confusion)
+        if self.confusion is None:
+            return None
+        classes, counts = self.confusion
+        ious = np.full(self.segmentation.num_classes, np.nan)
+        ious[classes] = class_ious(counts)
+        return ious
 
     @cached_property
     def nodes(self) -> list[tuple[int, str, int]]:
@@ -76,7 +84,8 @@ class PageInputs:
 def preview(run: PageInputs) -> Content:
     """Gaussians to look at in 3D, what to colour and hide, and where to look from."""
     scene, segmentation, views, tree = run.scene, run.segmentation, run.checked.views, run.segmentation.tree
-    first, colors, levels = segmentation.num_classes, run.colors, list[dict[str, Any]]()
+    num_classes = first = segmentation.num_classes  # To count them takes as long as to list them.
+    colors, levels = run.colors, list[dict[str, Any]]()
     if tree is not None and len(tree.granularities) > 1:
         first, colors = len(tree), palette(len(tree))
         levels = [_level(tree, granularity) for granularity in tree.granularities]
@@ -92,7 +101,7 @@ def preview(run: PageInputs) -> Content:
         seen, predicted = shown_at(POSTER_PX, run.images.of(view), ranked[0].completed(view.read_labels()))
         poster = overlay(seen, predicted, run.colors)
     legend = [
-        {"label": k, "name": name, "color": colors[k].tolist(), "count": count, "now": k < segmentation.num_classes}
+        {"label": k, "name": name, "color": colors[k].tolist(), "count": count, "now": k < num_classes}
         for k, name, count in run.nodes
     ]
     for i, (label, name) in enumerate(_NO_CLASS.items()):
@@ -161,9 +170,10 @@ def classes(run: PageInputs) -> Content:
 
 def confusion(run: PageInputs) -> Content | None:
     """Matrix of the classes that are confused most, and the largest confusions."""
-    counts, names = run.confusion, run.segmentation.class_names
-    if counts is None:
+    if run.confusion is None:
         return None
+    classes, counts = run.confusion
+    names = [run.segmentation.class_names[k] for k in classes.tolist()]
     shown = most_confused(counts, MATRIX_CLASSES)
     of_class = counts.sum(axis=1, keepdims=True)
     shares = (counts / np.maximum(of_class, 1))[np.ix_(shown, shown)]

@@ -16,6 +16,7 @@ from small_scenes import NAMES, NUM_CLASSES, balls_on_a_table, clean_views
 from gsseg_core.errors import PathTakenError, WriteError
 from gsseg_core.export import class_files as export
 from gsseg_core.export.class_files import class_file_name, export_classes
+from gsseg_core.export.pictures import legend, palette
 from gsseg_core.export.view_pictures import draw_views, view_file_name, write_pictures
 from gsseg_core.files.json_files import write_json
 from gsseg_core.files.run_folder import RUN_FILE
@@ -156,6 +157,14 @@ def test_pictures_are_an_overlay_per_view_a_contact_sheet_and_a_legend(tmp_path:
             assert np.asarray(image).std() > 5
     with Image.open(paths[0]) as image:
         assert image.size == (64, 48)
+
+
+def test_the_legend_of_a_vocabulary_has_the_classes_that_are_there(tmp_path: Path) -> None:
+    shown = {k: RESULT.class_names[k] for k in np.flatnonzero(RESULT.counts()).tolist()}
+    many = replace(RESULT, class_names={**RESULT.class_names, **{k: f"class {k}" for k in range(4, 20_000)}})
+    write_pictures(many, [], tmp_path)
+    with Image.open(tmp_path / "legend.png") as image:
+        np.testing.assert_array_equal(np.asarray(image), legend(shown, palette(20_000), many.counts()))
 
 
 def test_a_report_that_cannot_be_written_leaves_the_earlier_one(tmp_path: Path) -> None:

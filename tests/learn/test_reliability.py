@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import json
 import math
+import tracemalloc
 from functools import cache
 
 import numpy as np
 import pytest
-from small_scenes import HEIGHT, NAMES, NUM_CLASSES, WIDTH, balls_on_a_table, clean_views, ring, taught
+from small_scenes import HEIGHT, NAMES, NUM_CLASSES, WIDTH, balls_on_a_table, clean_views, ring, taught, wrong_views
 from view_errors import corrupt_views
 from wrong_masks import WrongMasks
 
@@ -93,6 +94,25 @@ def test_a_view_is_held_against_the_others_only() -> None:
     # Nobody else has seen what it shows, so only the empty rays, which belong to the background, say anything.
     assert alone.checked < truth.size and not alone.counts[1:].any()
     assert (alone.prediction()[truth > 0] == UNKNOWN).mean() > 0.9
+
+
+def test_a_mask_is_compared_by_the_classes_that_occur_however_many_names_there_are() -> None:
+    ids = np.array([0, 1, 700, 65_534])
+    truth, predicted = (wrong_views(2, seed=seed)[0].read_labels() for seed in (1, 2))
+    predicted[:5] = UNKNOWN
+    camera = CLEAN[0].camera
+    few = compare_mask(View.from_arrays(camera, truth), predicted, NUM_CLASSES)
+    view = View.from_arrays(camera, ids[truth].astype(np.int32))
+    far = np.where(predicted < 0, UNKNOWN, ids[predicted]).astype(np.int32)
+    tracemalloc.start()
+    many = compare_mask(view, far, 65_535)
+    peak = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    assert peak < 2**24, "of tables of all names, one row each would take 512 KiB"
+    assert many.classes.tolist() == ids[few.classes].tolist() and many.num_pixels == few.num_pixels
+    np.testing.assert_array_equal(many.counts[ids], few.counts)
+    assert many.checked == few.checked and many.reliability == few.reliability
+    assert many.confusions() == [(ids[k], ids[y], share) for k, y, share in few.confusions()]
 
 
 def test_a_prediction_of_another_view_or_of_other_classes_is_refused() -> None:

@@ -25,11 +25,21 @@ def check(name: str, classes: list[int], counts: list[list[int]]) -> ViewCheck:
 def test_confusion_is_the_sum_over_views_and_ignores_what_is_no_class() -> None:
     one = check("one", [0, 2], [[50, 3], [10, 0], [7, 30]])
     other = check("other", [1, UNKNOWN], [[4, 1], [5, 1], [0, 1]])
-    confusion = MaskChecks([one, other], {}, True).confusion(3)
+    classes, confusion = MaskChecks([one, other], {}, True).confusion()
+    assert classes.tolist() == [0, 1, 2]
     np.testing.assert_array_equal(confusion, [[50, 4, 3], [10, 5, 0], [7, 0, 30]])
     np.testing.assert_allclose(class_ious(confusion), [50 / 74, 5 / 19, 30 / 40])
     assert largest_confusions(confusion, 3) == [(1, 0, 10), (2, 0, 7), (0, 1, 4)]
     assert most_confused(confusion, 2) == [0, 1]
+
+
+def test_confusion_is_of_the_classes_that_occur_however_many_names_there_are() -> None:
+    pixels = np.zeros((65_535, 2), np.int64)
+    pixels[[7, 7, 60_000], [0, 1, 1]] = 5, 2, 9
+    classes, confusion = MaskChecks([ViewCheck("one", 16, np.array([3, 60_000]), pixels)], {}, True).confusion()
+    assert classes.tolist() == [3, 7, 60_000]
+    np.testing.assert_array_equal(confusion, [[0, 0, 0], [5, 0, 2], [0, 0, 9]])
+    assert [check.tolist() for check in MaskChecks([check("blank", [0], [[0]])], {}, True).confusion()] == [[], []]
 
 
 def test_iou_of_a_class_that_is_nowhere_is_not_a_number() -> None:

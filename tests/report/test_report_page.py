@@ -7,8 +7,10 @@ import hashlib
 import json
 import os
 import re
+from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
@@ -19,7 +21,8 @@ from gsseg_core.errors import WriteError
 from gsseg_core.report.findings import MaskChecks
 from gsseg_core.report.page import environment, report_page, write_report_page
 from gsseg_core.report.pictures import ViewImages
-from gsseg_core.report.sections import PageInputs
+from gsseg_core.report.sections import PageInputs, confusion, preview
+from gsseg_core.segmentation import Segmentation
 from gsseg_core.text import printable
 
 SCENE, TRUTH = balls_on_a_table()
@@ -112,6 +115,24 @@ def test_a_run_of_which_no_mask_can_be_shown_gets_a_page_too(out: Path) -> None:
     sections = {section["id"] for section in page.tagged("section")}
     assert sections == {"preview", "classes", "confidence", "time", "settings"}
     assert not page.tagged("img")
+
+
+def test_the_parts_of_a_page_of_a_vocabulary_are_made_in_its_length_not_its_square(
+    out: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    result, checked = segmented()
+    count, asked = 65_535, []
+    names = {**result.class_names, **{k: f"class {k}" for k in range(4, count)}}
+    monkeypatch.setattr(Segmentation, "num_classes", property(lambda self: asked.append(1) or len(self.class_names)))
+    report = json.loads((out / "report.json").read_text())
+    run = PageInputs(report, SCENE, replace(result, class_names=names), checked, ViewImages(SCENE))
+    few = PageInputs(report, SCENE, result, checked, ViewImages(SCENE))
+    assert confusion(run) == confusion(few)
+    assert run.ious is not None and few.ious is not None
+    np.testing.assert_array_equal(run.ious[:4], few.ious)
+    assert np.isnan(run.ious[4:]).all() and len(run.ious) == count
+    assert preview(run)["legend"] == preview(few)["legend"]
+    assert len(asked) < 100, "to count the names takes as long as to list them"
 
 
 def test_a_page_that_cannot_be_written_leaves_the_earlier_one(
