@@ -107,7 +107,11 @@ class _KernelCache(FunctionCache):
         rtsys.initialize(target_context)  # All that machine code needs of what numba makes ready to compile.
         # Of a kernel that calls one whose loops are parallel, numba may not have noted that it needs threads.
         _launch_threads()
-        return self._load_overload(sig, target_context)
+        try:
+            return self._load_overload(sig, target_context)
+        except (AttributeError, ImportError):  # It was compiled for a type that has gone, or has another name, since.
+            self.flush()
+            return None
 
 
 def keep(kernel: Dispatcher[Any]) -> None:

@@ -32,9 +32,9 @@ def package(tmp_path: Path) -> Path:
     return tmp_path
 
 
-def called_from(folder: Path) -> str:
+def called_from(folder: Path, call: str = CALL) -> str:
     """Call the kernel in a program of its own: what it returns, and how many kernels came from the cache."""
-    program = f"import sys; sys.path.insert(0, {str(folder)!r}); sys.dont_write_bytecode = True; {CALL}"
+    program = f"import sys; sys.path.insert(0, {str(folder)!r}); sys.dont_write_bytecode = True; {call}"
     done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True)
     return done.stdout.strip()
 
@@ -56,3 +56,23 @@ def test_a_kernel_is_compiled_anew_where_what_it_was_made_of_has_changed_and_now
     path = package / "made" / f"{file}.py"
     path.write_text(path.read_text().replace(before, after))
     assert called_from(package) == expected
+
+
+@pytest.mark.parametrize("file", ["pairs", "others"])
+def test_a_kernel_is_compiled_anew_where_a_type_that_it_takes_has_another_name_or_place(
+    tmp_path: Path, file: str
+) -> None:
+    made = tmp_path / "made"
+    made.mkdir()
+    kernel = "from gsseg_core.kernels.compiler import kernel\n\n@kernel\ndef add(pair):\n    return pair[0] + pair[1]\n"
+    double = "from made.{0} import {1}\nfrom made.adding import add\ndef double(x):\n    return add({1}(x, x))\n"
+    pair = "from collections import namedtuple\n{0} = namedtuple('{0}', ['one', 'other'])\n"
+    files = {"__init__": "", "adding": kernel, "pairs": pair.format("Pair"), "kernels": double.format("pairs", "Pair")}
+    for name, content in files.items():
+        (made / f"{name}.py").write_text(content)
+    call = CALL.replace("double.stats", "add.stats").replace("import double", "import add, double")
+    assert called_from(tmp_path, call) == "6 0" and called_from(tmp_path, call) == "6 1"
+    (made / "pairs.py").unlink()
+    (made / f"{file}.py").write_text(pair.format("Two"))
+    (made / "kernels.py").write_text(double.format(file, "Two"))
+    assert called_from(tmp_path, call) == "6 0" and called_from(tmp_path, call) == "6 1"
