@@ -152,16 +152,22 @@ class PerViewSession(LiveSession):
         """Replace all that is known by a saved state, as `LiveSession.load` does; its labels are numbers of objects."""
         with self._lock:
             loaded = super().load(path, within)
-            known = self._live.state()
-            votes = VoteTotal.from_rows(known.votes, known.num_classes, along_curve(self.scene))
-            for view in self._live.views.values():
-                if observation := self._table.adopt(view):
-                    observation.vote(votes, UNITS, -1)
+            if self.num_fused > self.num_views:
+                self._recall_dropped_views()
+            else:
+                self._table.adopt_all(list(self._live.views.values()))
             self._table.reserve(self._live.num_classes - 1)
-            if self.num_fused > self.num_views:  # The votes left are of dropped views: what these showed is not new.
-                rest = votes.rows()
-                self._table.recall(rest.with_data(rest.data * VOTE_UNIT))
         return loaded
+
+    def _recall_dropped_views(self) -> None:
+        """Have the table know the views that are kept; votes left are of dropped ones: what these showed is not new."""
+        known = self._live.state()
+        votes = VoteTotal.from_rows(known.votes, known.num_classes, along_curve(self.scene))
+        for view in self._live.views.values():
+            if observation := self._table.adopt(view):
+                observation.vote(votes, UNITS, -1)
+        rest = votes.rows()
+        self._table.recall(rest.with_data(rest.data * VOTE_UNIT))
 
     def _forget(self, class_names: Mapping[int, str], votes: VoteLearner) -> None:
         super()._forget(class_names, votes)

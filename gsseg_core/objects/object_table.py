@@ -148,6 +148,12 @@ class ObjectTable:
         self._give(view.name, self._lifted[view.name].ids)
         return observation
 
+    def adopt_all(self, views: Sequence[View]) -> None:
+        """Add views whose ids are the numbers of objects already, several at once; those that see nothing are not."""
+        for view, lifted in each_with_made(self._lift, views, self.device, silent, "lift"):
+            if self._add(view, lifted):
+                self._give(view.name, self._lifted[view.name].ids)
+
     def reserve(self, number: int) -> None:
         """Give no new object a number up to this one."""
         self._largest = max(self._largest, number)

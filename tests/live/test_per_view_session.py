@@ -27,6 +27,7 @@ from gsseg_core.learn.em.em_learner import EMLearner
 from gsseg_core.learn.learner_state import Learnt
 from gsseg_core.live.per_view_session import PerViewSession
 from gsseg_core.live.session import LiveSession
+from gsseg_core.objects.object_table import ObjectTable
 from gsseg_core.raster.backends import make_operator
 from gsseg_core.raster.view_operator import ViewOperator
 from gsseg_core.refine.settings import UNREFINED
@@ -74,6 +75,18 @@ def test_a_live_session_goes_on_with_its_objects_after_saving_and_loading(tmp_pa
     np.testing.assert_array_equal(other.codes(), session.codes())
     with pytest.raises(SettingsError, match="from the views received only"):
         other.learn(dataset=Dataset(write_dataset(tmp_path / "data")))
+
+
+def test_views_whose_ids_are_objects_are_known_the_same_when_they_come_together_or_one_by_one() -> None:
+    apart, together = ObjectTable(SCENE), ObjectTable(SCENE)
+    for view in VIEWS[:4]:
+        apart.adopt(view)
+    together.adopt_all(VIEWS[:4])
+    assert list(apart.views) == list(together.views) and apart.num_objects == together.num_objects > 1
+    one, other = apart._profiles.weights, together._profiles.weights
+    assert one.shape == other.shape and (one != other).nnz == 0
+    for name in apart.views:
+        assert apart.objects_in(name) == together.objects_in(name)
 
 
 def test_a_state_with_dropped_views_is_loaded_with_one_lift_of_each_kept_view(
