@@ -92,7 +92,9 @@ def _frequency(
     frequency = np.full(len(known), 1 / len(known))
     for _ in range(ROUNDS):
         frequency = known + counts @ _scaled(may_be * frequency)
-        frequency /= frequency.sum()
+        if not (total := frequency.sum()):
+            break  # None is known, and the others may be nothing: every class has votes against it.
+        frequency /= total
     return frequency
 
 

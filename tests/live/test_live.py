@@ -12,7 +12,9 @@ from patience import PATIENCE
 from small_scenes import NAMES, NUM_CLASSES, balls_on_a_table, clean_views, fed, taught, write_dataset, wrong_views
 
 from gsseg_core.data.dataset import Dataset
+from gsseg_core.data.label_evidence import LabelEvidence
 from gsseg_core.data.label_images import UNKNOWN
+from gsseg_core.data.soft_masks import SeenLabels
 from gsseg_core.data.view import View
 from gsseg_core.errors import (
     NoCodesError,
@@ -120,6 +122,14 @@ def test_a_view_that_is_refused_brings_no_class() -> None:
     unseen = blank(View(replace(VIEWS[0].camera, name="away", world_to_camera=away)), 200)
     assert session.fuse(unseen).reason == "sees_no_Gaussian"  # type: ignore[union-attr]
     assert session.class_names == names and session.codes().shape == shape
+
+
+def test_where_every_class_has_votes_against_it_nothing_is_known() -> None:
+    session, every = LiveSession(SCENE), np.arange(2, dtype=np.int32)
+    none_of_these = SeenLabels(np.zeros((48, 64), np.int32), LabelEvidence(every, np.zeros((1, 2), np.float32), every))
+    assert session.fuse(View.from_seen(clean_views(1)[0].camera, none_of_these)) is None
+    assert not session.codes().any()
+    assert not session.unrefined().confidence.any()
 
 
 def test_only_the_last_views_are_kept_and_no_vote_is_dropped() -> None:
