@@ -322,10 +322,11 @@ class Learner(ABC):
         if isinstance(opened, UnusableViewError):
             self.rejected[view.name] = str(opened)
             return False
+        if opened is not None:  # First: where there is no memory for its votes, the view in whose place it comes stays.
+            opened.vote(self._votes if total is None else total, UNITS)
         if view.name in self.views:
             self.retract(view.name)
         if opened is not None:
-            opened.vote(self._votes if total is None else total, UNITS)
             self._prepared.keep(view.name, opened)
         self.rejected.pop(view.name, None)
         self.views[view.name] = view

@@ -14,7 +14,7 @@ import numpy as np
 from gsseg_core.csr_rows import CSRRows
 from gsseg_core.data.dataset import Dataset
 from gsseg_core.data.view import View
-from gsseg_core.errors import GssegError, SettingsError
+from gsseg_core.errors import SettingsError
 from gsseg_core.learn.learner import UNITS, VOTE_UNIT
 from gsseg_core.learn.learner_state import Learnt, State
 from gsseg_core.learn.vote_learner import VoteLearner
@@ -50,7 +50,7 @@ class PerViewSession(LiveSession):
         undo = self._table.checkpoint()
         try:
             rejection = super()._fuse(self._table.match(view))
-        except GssegError:
+        except BaseException:  # Too little memory is no GssegError.
             undo()
             raise
         if rejection is not None:
@@ -67,8 +67,13 @@ class PerViewSession(LiveSession):
                 if self._table.sees_any(after):
                     self._fuse(after)
                 else:
-                    self._table.set_aside(after)
-                    self._live.move(name, after.camera)
+                    undo = self._table.checkpoint()
+                    try:
+                        self._table.set_aside(after)
+                        self._live.move(name, after.camera)
+                    except BaseException:
+                        undo()
+                        raise
                     self._version += 1
                 self._live.views = {name: self._live.views[name] for name in order}
             return era is self._era
@@ -85,15 +90,15 @@ class PerViewSession(LiveSession):
         """
         with self._lock:
             undo, every = self._table.checkpoint(), list(self._live.views)
-            repair, order = self._table.solve(), [name for name in self._live.views if self._table.sees(name)]
-            moved = (repair.successors != np.arange(len(repair.successors))).any()
-            forgotten = self.num_fused > len(order)
-            names = order if moved and forgotten else [name for name in order if name in set(repair.changed)]
-            views = {name: self._table.relabelled(self._table.views[name]) for name in names}
             try:
+                repair, order = self._table.solve(), [name for name in self._live.views if self._table.sees(name)]
+                moved = (repair.successors != np.arange(len(repair.successors))).any()
+                forgotten = self.num_fused > len(order)
+                names = order if moved and forgotten else [name for name in order if name in set(repair.changed)]
+                views = {name: self._table.relabelled(self._table.views[name]) for name in names}
                 if views:  # All at once: if there is no room for all, there are no more classes than before.
                     self._grow_for(max(views.values(), key=lambda view: view.largest_label))
-            except GssegError:
+            except BaseException:
                 undo()
                 raise
             if moved and forgotten:  # What is left once the views have gone is of those that are no longer kept.

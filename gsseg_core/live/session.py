@@ -158,6 +158,9 @@ class LiveSession:
                 rejection = self._fuse(view)
             except GssegError as error:
                 rejection = self.reject(Rejection.of(error))
+            except BaseException:  # Too little memory: what was there before is still of use.
+                self._live.resize(num_classes)
+                raise
             if rejection is not None:  # Nor do classes come with it.
                 self._live.resize(num_classes)
             return rejection

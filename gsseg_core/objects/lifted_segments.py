@@ -77,6 +77,12 @@ class Profiles:
         heavy = order[_heaviest(objects[order], weights[order], np.bincount(objects, weights, shape[1]), kept)]
         return cls(sparse.csr_matrix((weights[heavy], (ids[heavy], objects[heavy])), shape=shape))
 
+    def copy(self) -> Profiles:
+        """Return another one like it, in no more memory."""
+        other = Profiles(self._sum)
+        other._more = list(self._more)
+        return other
+
     def add(self, segments: Lifted, objects: np.ndarray) -> None:  # (L,)
         """Add the segments of a view to their objects."""
         part = _by_object(segments, objects, int(objects.max(initial=0)) + 1).tocoo()

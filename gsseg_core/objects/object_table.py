@@ -108,30 +108,31 @@ class ObjectTable:
         changed.
         """
         undo = self.checkpoint()
-        if not self.add(view):
-            return _without_labels(view)
-        lifted = self._lifted[view.name]
-        best, seen = self._profiles.explain(lifted)
-        new = (lifted.ids > 0) & (seen < self.settings.unseen)
-        best[lifted.ids == 0] = 0
-        best[new] = self._largest + 1 + np.arange(np.count_nonzero(new))
-        if best.max(initial=0) > MAX_LABEL:
+        try:
+            if not self.add(view):
+                return _without_labels(view)
+            lifted = self._lifted[view.name]
+            best, seen = self._profiles.explain(lifted)
+            new = (lifted.ids > 0) & (seen < self.settings.unseen)
+            best[lifted.ids == 0] = 0
+            best[new] = self._largest + 1 + np.arange(np.count_nonzero(new))
+            if best.max(initial=0) > MAX_LABEL:
+                raise UnknownLabelError(f"view '{view.name}': shows object {best.max()}; expected at most {MAX_LABEL}")
+            self._give(view.name, best)
+            return self.relabelled(view)
+        except BaseException:  # Too little memory for views of very many segments, too.
             undo()
-            raise UnknownLabelError(f"view '{view.name}': shows object {best.max()}; expected at most {MAX_LABEL}")
-        self._give(view.name, best)
-        return self.relabelled(view)
+            raise
 
     def checkpoint(self) -> Callable[[], None]:
         """Return what goes back to the present state, after `add`, `match`, `remove` or `solve`; not after `forget`."""
         views, lifted, objects = dict(self.views), dict(self._lifted), dict(self._objects)
         others = self._largest, self._agreement, self._forgotten
+        profiles = self._profiles.copy()
 
-        def undo() -> None:
-            same = len(objects) == len(self._objects) and all(self._objects.get(n) is objects[n] for n in objects)
-            self.views, self._lifted, self._objects = views, lifted, objects
+        def undo() -> None:  # It takes no memory: there may be none.
+            self.views, self._lifted, self._objects, self._profiles = views, lifted, objects, profiles
             self._largest, self._agreement, self._forgotten = others
-            if not same:
-                self._fill()
 
         return undo
 

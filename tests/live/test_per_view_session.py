@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -27,9 +28,11 @@ from gsseg_core.learn.em.em_learner import EMLearner
 from gsseg_core.learn.learner_state import Learnt
 from gsseg_core.live.per_view_session import PerViewSession
 from gsseg_core.live.session import LiveSession
+from gsseg_core.objects.lifted_segments import Profiles
 from gsseg_core.objects.object_table import ObjectTable
 from gsseg_core.raster.backends import make_operator
 from gsseg_core.raster.view_operator import ViewOperator
+from gsseg_core.raster.vote_total import VoteTotal
 from gsseg_core.refine.settings import UNREFINED
 from gsseg_core.scene.camera import Camera
 from gsseg_core.scene.gaussian_scene import GaussianScene
@@ -203,6 +206,54 @@ def test_a_view_of_too_many_objects_is_refused_and_uses_up_no_number() -> None:
     assert few.class_names == {0: "background", 1: "object_001"}
     session.repair()
     np.testing.assert_array_equal(session.codes(), before)
+
+
+@pytest.mark.parametrize(
+    ("owner", "starved"),
+    [(ObjectTable, "_lift"), (Profiles, "explain"), (Profiles, "add"), (ObjectTable, "relabelled"),
+     (VoteTotal, "_make_room")],
+)  # fmt: skip
+def test_a_view_that_there_is_no_memory_for_changes_nothing(
+    owner: type, starved: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def without_memory(*_: object, **__: object) -> None:
+        raise MemoryError
+
+    session, other = PerViewSession(SCENE), PerViewSession(SCENE)
+    for view in VIEWS[:2]:
+        assert session.fuse(shuffled(view)) is None and other.fuse(shuffled(view)) is None
+    new = with_labels(VIEWS[2], np.where(np.arange(64) < 9, 77, VIEWS[2].read_labels()))
+    for view in (new, in_halves(VIEWS[1], 1)):  # another one, and one in the place of one that is kept
+        with monkeypatch.context() as patch, pytest.raises(MemoryError):
+            patch.setattr(owner, starved, without_memory)
+            session.fuse(view)
+        assert list(session._table.views) == list(session._table._objects) == session.view_names == other.view_names
+        assert session.class_names == other.class_names and session.num_fused == 2
+        np.testing.assert_array_equal(session.codes(), other.codes())
+    for each in (session, other):
+        assert each.fuse(shuffled(VIEWS[2])) is None
+        each.repair()
+    np.testing.assert_array_equal(session.codes(), other.codes())
+
+
+@pytest.mark.parametrize("starved", ["solve", "relabelled"])
+def test_a_repair_that_there_is_no_memory_for_changes_nothing(starved: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    session = PerViewSession(SCENE)
+    for view in [in_halves(VIEWS[0], 1), *VIEWS[1:4]]:
+        assert session.fuse(shuffled(view)) is None
+    before, found = session.codes(), {name: ids.tolist() for name, ids in session._table._objects.items()}
+    work = getattr(ObjectTable, starved)
+
+    def without_memory(*given: Any) -> None:
+        work(*given)
+        raise MemoryError
+
+    with monkeypatch.context() as patch, pytest.raises(MemoryError):
+        patch.setattr(ObjectTable, starved, without_memory)
+        session.repair()
+    np.testing.assert_array_equal(session.codes(), before)
+    assert {name: ids.tolist() for name, ids in session._table._objects.items()} == found
+    assert session.repair().changed
 
 
 def test_a_repair_that_finds_too_many_objects_changes_nothing() -> None:
