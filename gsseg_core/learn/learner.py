@@ -322,11 +322,15 @@ class Learner(ABC):
         if isinstance(opened, UnusableViewError):
             self.rejected[view.name] = str(opened)
             return False
+        total = self._votes if total is None else total
         if opened is not None:  # First: where there is no memory for its votes, the view in whose place it comes stays.
-            opened.vote(self._votes if total is None else total, UNITS)
-        if view.name in self.views:
-            self.retract(view.name)
-        if opened is not None:
+            opened.vote(total, UNITS)
+            try:
+                if view.name in self.views:
+                    self.retract(view.name)
+            except BaseException:
+                opened.vote(total, UNITS, -1)
+                raise
             self._prepared.keep(view.name, opened)
         self.rejected.pop(view.name, None)
         self.views[view.name] = view

@@ -35,7 +35,11 @@ class VoteLearner(Learner):
         before = self._observed(name)
         after, seen = replace(before, camera=camera), read_mask(before, self.num_classes)
         self._lift(after, seen, 1)
-        self._lift(before, seen, -1)
+        try:
+            self._lift(before, seen, -1)
+        except BaseException:  # Too little memory.
+            self._lift(after, seen, -1)
+            raise
         self.views[name] = after
         self._prepared.drop(name)
 

@@ -140,15 +140,15 @@ class LivingSession(LiveSession):
         self, before: LivingScene, after: LivingScene, origin: np.ndarray, joining: Mapping[str, int | None]
     ) -> Changed:
         change = SceneChange(before, after, origin)
+        first = without_colours(self._living) if self._first is self._living else self._first
+        learnt = None if self._learnt is None else self._learnt.carried(change.carry)
+        past = {scene: np.where(origin >= 0, places[origin], -1) for scene, places in self._past.items()}
         all_kept = self.num_fused == len(self._live.views)
         lifted = len(self._live.change(change, joining, all_kept=all_kept))
-        if self._first is self._living:
-            self._first = without_colours(self._living)
-        if self._learnt is not None:
-            self._learnt = self._learnt.carried(change.carry)
-        self._past[self.scene] = np.arange(len(before))
-        for scene, places in self._past.items():
-            self._past[scene] = np.where(origin >= 0, places[origin], -1)
+        # From here on nothing can go wrong.
+        self._first, self._learnt = first, learnt
+        self._past.update(past)
+        self._past[self.scene] = origin
         self._living = after
         self.scene = after.scene
         self._version += 1

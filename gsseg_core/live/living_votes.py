@@ -85,13 +85,19 @@ class LivingVotes(VoteLearner):
         from_nothing = all_kept and 2 * len(lifted) > len(views)
         names = list(views) if from_nothing else lifted
         order = along_curve(change.after.scene)
-        if from_nothing:
-            self._votes = VoteTotal(len(change.after), self.num_classes, order)
-        else:
-            self._lift_all(self.views, lifted, -1)
-            self._votes = VoteTotal.from_rows(change.carry(self._votes.rows()), self.num_classes, order)
-        self.living, self.scene = change.after, change.after.scene
-        self._lift_all(views, names, 1)
+        taken_back, before = [] if from_nothing else lifted, (self._votes, self.living, self.scene)
+        self._lift_all(self.views, taken_back, -1)
+        try:
+            if from_nothing:
+                self._votes = VoteTotal(len(change.after), self.num_classes, order)
+            else:
+                self._votes = VoteTotal.from_rows(change.carry(self._votes.rows()), self.num_classes, order)
+            self.living, self.scene = change.after, change.after.scene
+            self._lift_all(views, names, 1)
+        except BaseException:  # Too little memory: the scene stays, and with it its votes.
+            self._votes, self.living, self.scene = before
+            self._lift_all(self.views, taken_back, 1)
+            raise
         self.views = views
         for name in lifted:
             self._ends.pop(views[name], None)
@@ -109,10 +115,18 @@ class LivingVotes(VoteLearner):
         return ends if self.device == "cpu" else None
 
     def _lift_all(self, views: Mapping[str, View], names: list[str], sign: int) -> None:
-        # In the order of groups, so that the scene is brought into the frame of each but once.
-        for name in sorted(names, key=lambda name: str(views[name].group)):
-            # A view that sees nothing any more is kept: it may see what is added later.
-            self._lift(views[name], read_mask(views[name], self.num_classes), sign)
+        """Add the votes of some views, or take them away; of all, or on any error of none."""
+        done = list[str]()
+        try:
+            # In the order of groups, so that the scene is brought into the frame of each but once.
+            for name in sorted(names, key=lambda name: str(views[name].group)):
+                # A view that sees nothing any more is kept: it may see what is added later.
+                self._lift(views[name], read_mask(views[name], self.num_classes), sign)
+                done.append(name)
+        except BaseException:
+            for name in done:
+                self._lift(views[name], read_mask(views[name], self.num_classes), -sign)
+            raise
 
     def _joined(self, view: View, group: int | None) -> View:
         """Have a view belong to a group: it stays where it is in the scene, and from then on moves along."""

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import itertools
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -20,6 +22,7 @@ from gsseg_core.errors import (
     StateMismatchError,
 )
 from gsseg_core.learn.learner import VOTE_UNIT
+from gsseg_core.learn.vote_learner import VoteLearner
 from gsseg_core.live.living_session import LivingSession
 from gsseg_core.live.per_view_session import PerViewSession
 from gsseg_core.live.session import LiveSession
@@ -205,6 +208,38 @@ def test_a_change_that_does_not_fit_is_refused_in_one_line_and_changes_nothing(d
         refusing.update(delta)
     np.testing.assert_array_equal(votes(refusing), before)
     assert refusing.living is scene
+
+
+@pytest.mark.parametrize("starved_at", range(1, 10))
+def test_a_change_that_there_is_no_memory_for_changes_nothing(starved_at: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    session = LivingSession(SCENE, NAMES)
+    for view in clean_views(6):
+        assert session.fuse(view) is None
+    session.fuse(blank_view := replace(clean_views(6)[0], group=0))
+    before, votes, views = session.living, session._live._votes.dense(), dict(session._live.views)
+    calls, lift = itertools.count(1), VoteLearner._lift
+
+    def without_memory(learner: VoteLearner, *given: Any) -> bool:
+        if next(calls) == starved_at:
+            raise MemoryError
+        return lift(learner, *given)
+
+    moved = Similarity(translation=np.array([0.2, 0.0, 0.0]))
+    delta = SceneDelta(removed=np.arange(3), moves=(GroupMove(0, moved, (blank_view.name,)),))
+    with monkeypatch.context() as patch:
+        patch.setattr(VoteLearner, "_lift", without_memory)
+        try:
+            session.update(delta)
+        except MemoryError:
+            assert session.living is before and session.scene is before.scene
+            np.testing.assert_array_equal(session._live._votes.dense(), votes)
+            assert dict(session._live.views) == views
+            patch.undo()
+            session.update(delta)
+    fresh = LivingSession(session.living, NAMES)
+    for view in session.views:
+        assert fresh.fuse(view) is None
+    np.testing.assert_array_equal(session._live._votes.dense(), fresh._live._votes.dense())
 
 
 def test_the_last_gaussian_is_not_removed() -> None:
