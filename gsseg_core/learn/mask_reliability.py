@@ -272,12 +272,19 @@ def _occurring(labels: np.ndarray, count: int) -> tuple[np.ndarray, np.ndarray]:
     Those that do not have -1 for a place, and so has `UNKNOWN`, at last. A table of all names would take gigabytes
     where there are tens of thousands.
     """
-    occurs = np.zeros(count + 1, bool)
-    occurs[labels] = True
+    occurs = np.zeros(count + 1, np.bool_)
+    _mark(labels, occurs)
     present = np.flatnonzero(occurs[:-1])
     place = np.full(count + 1, UNKNOWN)
     place[present] = np.arange(len(present))
     return present, place
+
+
+@kernel
+def _mark(labels: np.ndarray, occurs: np.ndarray) -> None:  # (H, W), of which -1 is the last place; out
+    for y in range(labels.shape[0]):
+        for x in range(labels.shape[1]):
+            occurs[labels[y, x]] = True
 
 
 @kernel
