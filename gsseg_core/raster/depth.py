@@ -12,6 +12,7 @@ from gsseg_core.raster.view_operator import ViewOperator
 from gsseg_core.raster.view_renderer import EVERY_PIXEL, Blended, PixelGrid
 from gsseg_core.scene.camera import Camera
 from gsseg_core.scene.gaussian_scene import GaussianScene
+from gsseg_core.simd import AHEAD, prefetch
 
 COVERED = 0.5  # accumulated alpha above which a pixel belongs to a silhouette
 BEHIND = 1.02  # what is deeper than the surface of the scene by more than this factor is hidden
@@ -56,8 +57,9 @@ def depths(scene: GaussianScene, camera: Camera, ids: np.ndarray | None = None) 
 
 @kernel(parallel=True)
 def _depths(means: np.ndarray, ids: np.ndarray, row: np.ndarray) -> np.ndarray:  # (N, 3), (M,), (4,) float64
-    depth = np.empty(ids.shape[0], np.float32)
+    depth, last = np.empty(ids.shape[0], np.float32), ids.shape[0] - 1
     for m in nb.prange(ids.shape[0]):
+        prefetch(means, ids[min(m + AHEAD, last)])
         i = ids[m]
         depth[m] = max(means[i, 0] * row[0] + means[i, 1] * row[1] + means[i, 2] * row[2] + row[3], 0.0)
     return depth

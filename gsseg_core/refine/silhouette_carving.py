@@ -102,47 +102,57 @@ def kept_shares(
     It is 1 where there is no object or no view says anything.
     """
     labels = np.ascontiguousarray(labels, np.int32)
-    go, kept, stay = np.zeros(len(scene)), np.ones(len(scene)), np.zeros(len(scene))
+    go, kept = np.zeros(len(scene)), np.ones(len(scene))
     known: list[tuple[_Shown, ObjectsAlone | None]] = []  # views, and the objects in them as far as memory allows
     taken = 0
-    for shown, alone, reasons in several_at_once(partial(_look, scene, labels, look), views, device):
+    for shown, alone, (ids, reasons) in several_at_once(partial(_look, scene, labels, look), views, device):
         fits = taken + alone.nbytes <= _MEMORY
         known.append((shown, alone if fits else None))
         taken += alone.nbytes if fits else 0
-        go[alone.ids] += reasons
-    asked = go > 0
+        go[ids] += reasons
+    asked = np.flatnonzero(go)  # a few in a hundred; all others keep all
     for step in range(steps):
-        stay[asked] = 0
-        speak = partial(_reasons_to_stay, scene, labels, device, kept.astype(np.float32), asked)
-        for ids, reasons in several_at_once(speak, known, device):
+        shares, stay = np.ones(len(scene), np.float32), np.zeros(len(scene))
+        shares[asked], is_asked = kept[asked], np.zeros(len(scene), bool)
+        is_asked[asked] = True
+        speak = partial(_reasons_to_stay, scene, labels, device, shares, is_asked)
+        for ids, reasons in several_at_once(speak, known if len(asked) else (), device):
             stay[ids] += reasons
         kept[asked] = np.clip(kept[asked] * stay[asked] / go[asked], _LEAST, 1.0)
         if step == 0:
             # The less is kept, the more reason there is to stay: who stays beside all others stays beside fewer.
-            asked &= kept < 1
+            asked = asked[kept[asked] < 1]
     return kept
 
 
 def _look(
     scene: GaussianScene, labels: np.ndarray, look: Callable[[T], Silhouette], view: T
-) -> tuple[_Shown, ObjectsAlone, np.ndarray]:
-    """Tell what a view shows, which objects are in it, and what speaks there against each Gaussian in its object."""
+) -> tuple[_Shown, ObjectsAlone, tuple[np.ndarray, np.ndarray]]:
+    """Tell what a view shows, which objects are in it, and which Gaussians something speaks against there: how much."""
     operator, seen, depth, stands_for = look(view)
     alone = operator.objects_alone(labels)
     reasons = alone.reasons_to_go(depths(scene, operator.camera, alone.ids), seen, depth * np.float32(BEHIND))
-    return _Shown(operator.camera, seen, stands_for), alone, stands_for * reasons
+    some = np.flatnonzero(reasons)
+    return _Shown(operator.camera, seen, stands_for), alone, (alone.ids[some], stands_for * reasons[some])
 
 
 def _reasons_to_stay(
     scene: GaussianScene, labels: np.ndarray, device: str, shares: np.ndarray, asked: np.ndarray,
     view: tuple[_Shown, ObjectsAlone | None],
 ) -> tuple[np.ndarray, np.ndarray]:  # fmt: skip
-    """Weigh what speaks in one view for those that are asked for, (N,) bool: which they are, and how much."""
+    """Weigh what speaks in one view for those that are asked for, (N,) bool: which they are, and how much.
+
+    The others keep all: shares, (N,) float32, are 1.
+    """
     shown, alone = view
     alone = alone or make_operator(scene, shown.camera, device).objects_alone(labels)
-    wanted = asked[alone.ids]
-    reasons = alone.reasons_to_stay(shares[alone.ids], wanted, shown.labels)
-    return alone.ids[wanted], shown.stands_for * reasons[wanted]
+    wanted, kept = asked[alone.ids], np.ones(len(alone.ids), np.float32)
+    some = np.flatnonzero(wanted)
+    ids = alone.ids[some]
+    if not len(ids):
+        return ids, np.empty(0)
+    kept[some] = shares[ids]
+    return ids, shown.stands_for * alone.reasons_to_stay(kept, wanted, shown.labels)[some]
 
 
 class _Shown(NamedTuple):

@@ -23,9 +23,9 @@ class TileObjects(ObjectsAlone):
     @classmethod
     def of(cls, ids: np.ndarray, tiles: Tiles, labels: np.ndarray) -> TileObjects:
         """Choose them among the Gaussians of a view, `ids` (M',), by the labels (N,) int32 of the whole scene."""
-        start, entries, rows = silhouette_kernels.choose(tiles.start, tiles.entries, labels[ids])
-        ids, none = ids[rows], np.empty(0, np.int32)
-        return cls(ids, labels[ids], tiles._replace(
+        labels, none = labels[ids], np.empty(0, np.int32)
+        start, entries, rows = silhouette_kernels.choose(tiles.start, tiles.entries, labels)
+        return cls(ids[rows], labels[rows], tiles._replace(
             table=take_rows(tiles.table, rows), start=start, entries=entries,
             gaussian_start=none.astype(np.int64), gaussian_entries=none,
         ))  # fmt: skip
@@ -39,10 +39,10 @@ class TileObjects(ObjectsAlone):
         """Weigh what speaks against each Gaussian in its object."""
         go = np.zeros(len(self.tiles.entries), np.float32)
         silhouette_kernels.reasons_to_go(self.tiles, self.labels, depths, shown, hidden_from, go)
-        return np.bincount(self.tiles.entries, go, len(self.ids))
+        return silhouette_kernels.sums(self.tiles.entries, go, len(self.ids))
 
     def reasons_to_stay(self, kept: np.ndarray, asked: np.ndarray, shown: np.ndarray) -> np.ndarray:
         """Weigh what speaks for each Gaussian in its object."""
         stay, count = np.zeros(len(self.tiles.entries), np.float32), int(self.labels.max(initial=0)) + 1
         silhouette_kernels.reasons_to_stay(self.tiles, self.labels, count, kept, asked, shown, stay)
-        return np.bincount(self.tiles.entries, stay, len(self.ids))
+        return silhouette_kernels.sums(self.tiles.entries, stay, len(self.ids))

@@ -25,6 +25,7 @@ from gsseg_core.simd import (
 
 ROUNDING = np.float32(1e-3)  # of 1 - T, below which a pixel is as good as empty
 _UNKNOWN, _MIXED = np.int32(-1), np.int32(-2)  # in place of the one label that a block or a tile shows
+_NOT_SHOWN = TILE * TILE  # in place of a label's slot: a tile shows no more labels than it has pixels
 
 
 @kernel
@@ -105,36 +106,41 @@ def reasons_to_stay(
     stride = stride_of(tiles.rows)
     for turn in nb.prange(tiles.rows * tiles.columns):
         tile = tile_of_turn(turn, tiles.columns, tiles.rows, stride)
-        # Only objects of which somebody is asked for.
-        slots, count = np.full(num_labels, -1, np.int64), 0
-        for e in range(start[tile], start[tile + 1]):
-            label = labels[entries[e]]
-            if asked[entries[e]] and slots[label] < 0:
-                slots[label] = count
-                count += 1
+        seen = np.full((TILE, TILE), _UNKNOWN, np.int32)
+        corner = corner_of(tiles, tile)
+        _cut(shown, *corner, seen)
+        slots = np.full(num_labels, _NOT_SHOWN, np.int64)
+        shows, count = _blocks_by_slot(seen, slots)
         if not count:
             continue
-        fresh, lines = np.empty((TILE, TILE), np.float32), np.empty((2, TILE), np.float32)
-        left, top, inside = open_rays(tiles, tile, fresh)
-        wanted = np.zeros(count, np.int64)  # blocks that they reach
-        for e in range(start[tile], start[tile + 1]):
-            if asked[entries[e]]:
-                wanted[slots[labels[entries[e]]]] |= aim(table, entries[e], left, top, lines) & inside
-        seen = np.full((TILE, TILE), _UNKNOWN, np.int32)
-        _cut(shown, *corner_of(tiles, tile), seen)
-        through = np.ones((count * TILE, TILE), np.float32)  # T_k, block by block
-        live = wanted & _blocks_of(seen, slots, count)  # those that show the object, until it covers all in them
+        left, top = np.float32(corner[0] + 0.5), np.float32(corner[1] + 0.5)
+        lines = np.empty((2, 2, TILE), np.float32)
+        live = np.zeros_like(shows)  # blocks that show the object and who is asked for, until it covers all in them
         for e in range(start[tile], start[tile + 1]):
             g = entries[e]
             slot = slots[labels[g]]
-            if slot < 0 or not live[slot]:
-                continue
-            reached = aim(table, g, left, top, lines) & live[slot]
+            if asked[g] and live[slot] != shows[slot]:
+                live[slot] |= aim(table, g, left, top, lines[0]) & shows[slot]
+        members, n = np.empty(start[tile + 1] - start[tile] + 1, np.int32), 0
+        for e in range(start[tile], start[tile + 1]):  # without a branch: who is not wanted is overwritten
+            members[n] = entries[e]
+            n += live[slots[labels[entries[e]]]] != 0
+        if not n:
+            continue
+        through = np.ones((count * TILE, TILE), np.float32)  # T_k, block by block
+        # Aimed one early, as in `aim_next`.
+        ahead = aim(table, members[0], left, top, lines[0])
+        for m in range(n):
+            g, its = members[m], lines[m % 2]
+            slot = slots[labels[g]]
+            reached = ahead & live[slot]
+            if m + 1 < n and live[slots[labels[members[m + 1]]]]:
+                ahead = aim(table, members[m + 1], left, top, lines[(m + 1) % 2])
             while reached:
                 b = first_bit(reached)
                 reached &= reached - 1
                 before = load_row(through, slot * TILE + b)
-                share = add_scaled(zero_row(), alpha_of(b, lines, table[g, WIDTH]), -kept[g])
+                share = add_scaled(zero_row(), alpha_of(b, its, table[g, WIDTH]), -kept[g])
                 after = add_product(before, before, share)
                 store_row(through, slot * TILE + b, after)
                 if sum_row(after) < T_MIN:
@@ -143,14 +149,24 @@ def reasons_to_stay(
         _weigh(seen, slots, through, need)
         for e in range(start[tile], start[tile + 1]):
             g = entries[e]
-            if asked[g] and live[slots[labels[g]]]:
-                slot, total = slots[labels[g]], zero_row()
-                reached = aim(table, g, left, top, lines) & live[slot]
+            slot, total = slots[labels[g]], zero_row()
+            if asked[g] and live[slot]:
+                reached = aim(table, g, left, top, lines[0]) & live[slot]
                 while reached:
                     b = first_bit(reached)
                     reached &= reached - 1
-                    total = add_product(total, alpha_of(b, lines, table[g, WIDTH]), load_row(need, slot * TILE + b))
+                    total = add_product(total, alpha_of(b, lines[0], table[g, WIDTH]), load_row(need, slot * TILE + b))
                 stay[e] = sum_row(total)
+
+
+@kernel
+def sums(entries: np.ndarray, weights: np.ndarray, count: int) -> np.ndarray:  # (E,) int32, (E,) float32
+    """Add up the weights of each Gaussian's entries, (count,) float64: as `bincount`, but most are 0 and left out."""
+    total = np.zeros(count)
+    for e in range(entries.shape[0]):
+        if weights[e] != 0:
+            total[entries[e]] += weights[e]
+    return total
 
 
 @called_by_kernels
@@ -189,19 +205,23 @@ def _joined(known: np.int32, label: np.int32) -> np.int32:
 
 @called_by_kernels
 def _slot_of(label: int, slots: np.ndarray) -> int:
-    return slots[label] if 0 < label < len(slots) else -1
+    return slots[label] if 0 < label < len(slots) else _NOT_SHOWN
 
 
 @called_by_kernels
-def _blocks_of(seen: np.ndarray, slots: np.ndarray, count: int) -> np.ndarray:  # (16, 16)
-    """Blocks of a tile that show each label, as bits, (count,) int64."""
-    blocks = np.zeros(count, np.int64)
+def _blocks_by_slot(seen: np.ndarray, slots: np.ndarray) -> tuple[np.ndarray, int]:  # (16, 16); by label, changed
+    """Give each label that a tile shows a slot; returns in which blocks it is, as bits by slot, and how many slots."""
+    blocks, count = np.zeros(_NOT_SHOWN + 1, np.int64), 0
     for b in range(TILE):
         for i in range(TILE):
-            slot = _slot_of(seen[b, i], slots)
-            if slot >= 0:
-                blocks[slot] |= 1 << b
-    return blocks
+            label = seen[b, i]
+            if not 0 < label < len(slots):
+                continue
+            if slots[label] == _NOT_SHOWN:
+                slots[label] = count
+                count += 1
+            blocks[slots[label]] |= 1 << b
+    return blocks, count
 
 
 @called_by_kernels(fastmath={"contract", "nnan", "nsz"}, error_model="numpy")
@@ -212,6 +232,6 @@ def _weigh(
     for b in range(TILE):
         for i in range(TILE):
             slot = _slot_of(seen[b, i], slots)
-            if slot >= 0:
+            if slot != _NOT_SHOWN:
                 n = slot * TILE + b
                 need[n, i] = through[n, i] / (np.float32(1) - through[n, i] + ROUNDING)
