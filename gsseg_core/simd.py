@@ -121,10 +121,14 @@ class Builder:
         add = self._instruction("vector.reduce.fadd", F32, [F32, ROW])
         return self.llvm.call(add, [ir.Constant(F32, -0.0), a], fastmath=("reassoc", "nsz"))
 
+    def sum_of_bits(self, a: Any) -> Any:
+        """Sum of sixteen int32, which must be one."""
+        return self.llvm.call(self._instruction("vector.reduce.add", I32, [BITS]), [a])
+
     def _instruction(self, name: str, result: Any, arguments: list[Any]) -> Any:
         kind = ir.FunctionType(result, arguments)
         insert: Any = cgutils.get_or_insert_function
-        return insert(self.llvm.module, kind, f"llvm.{name}.v{LANES}f32")
+        return insert(self.llvm.module, kind, f"llvm.{name}.v{LANES}{'i' if BITS in arguments else 'f'}32")
 
     def exp2(self, power: Any) -> Any:
         """2^power for powers in [-126, 127]; anything for others."""
@@ -191,6 +195,14 @@ def count_at_most(build: Builder, numbers: Any, i: Any, limit: Any) -> Any:
     address = build.llvm.bitcast(build.row(0), ir.PointerType(BITS))
     found = build.llvm.icmp_signed("<=", build.llvm.load(address, align=4, typ=BITS), build.broadcast(limit, BITS))
     return build.llvm.ctpop(build.bits(found))
+
+
+@operation(types.int64, None, None, types.int64)
+def sum_where(build: Builder, numbers: Any, i: Any, bits: Any) -> Any:
+    """Sum of the sixteen int32 in row i in the lanes of the bits that are set; it must be one itself."""
+    row = build.llvm.load(build.llvm.bitcast(build.row(0), ir.PointerType(BITS)), align=4, typ=BITS)
+    kept = build.llvm.select(build.lanes(bits), row, ir.Constant(BITS, [0] * LANES))
+    return build.llvm.sext(build.sum_of_bits(kept), I64)
 
 
 @operation(row_type)

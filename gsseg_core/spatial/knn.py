@@ -27,16 +27,16 @@ LEAST = np.finfo(np.float32).tiny  # a bound that even points in one place are b
 
 
 class Lists(NamedTuple):
-    """The nearest others of M points, one point after the other."""
+    """What is listed of M points, one point after the other: the places of their nearest others, say."""
 
     counts: np.ndarray  # (M,) int64: how many of each point are listed
-    places: np.ndarray  # (M capacity,) int32: those of each chunk of points from CHUNK * capacity on
+    entries: np.ndarray  # (M capacity,): those of each chunk of points from CHUNK * capacity on
 
     def joined(self) -> np.ndarray:
-        """Put the places of all points together."""
+        """Put the entries of all points together."""
         lengths = np.add.reduceat(self.counts, np.arange(0, len(self.counts), CHUNK)).tolist()
-        first = CHUNK * (len(self.places) // len(self.counts))
-        return np.concatenate([self.places[first * chunk :][:length] for chunk, length in enumerate(lengths)])
+        first = CHUNK * (len(self.entries) // len(self.counts))
+        return np.concatenate([self.entries[first * chunk :][:length] for chunk, length in enumerate(lengths)])
 
 
 @kernel(parallel=True)

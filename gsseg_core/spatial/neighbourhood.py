@@ -11,23 +11,20 @@ among the k nearest share it equally, and sums are taken over whole numbers, whe
 from __future__ import annotations
 
 import threading
-from collections.abc import Callable
 from dataclasses import dataclass, field
-from functools import partial
 from typing import NamedTuple
 
 import numba as nb
 import numpy as np
 
-from gsseg_core.csr_rows import CSRRows, slices
-from gsseg_core.kernels.compiler import kernel
+from gsseg_core.csr_rows import CSRRows, slices, starts
+from gsseg_core.kernels.compiler import called_by_kernels, kernel
 from gsseg_core.scene.gaussian_scene import GaussianScene
 from gsseg_core.scene.scene_cache import PerScene
-from gsseg_core.simd import at_most, first_bit, load_row
+from gsseg_core.simd import at_most, count_bits, load_row
 from gsseg_core.spatial import knn
 from gsseg_core.spatial.kd_tree import LEAF, Tree, leaf_range, scaled, tree_of
-
-CODE_UNIT = 2.0**-24  # codes are summed in steps of this, which is the precision of a float32 near 1
+from gsseg_core.spatial.leaf_codes import LeafCodes, add_leaf, none_of, take_first
 
 HALF = 3.0
 """Evidence in px with which a Gaussian has half of the weight in its neighbours' means that it could have at most."""
@@ -88,33 +85,22 @@ class Neighbours:
 
         Rows that are not wanted have no entries either.
         """
-        order = self.tree.order
+        order, leaf_codes = self.tree.order, LeafCodes.build(self.tree, codes, weights, num_classes)
+        empty = nodes_without((weights > 0)[order], len(self.tree.blocks))
         selected = np.ones(len(order), bool) if wanted is None else wanted[order]
-        means_of, parts = self._prepared(codes, weights, selected), [CSRRows.empty(0)]
-        # A block at a time is written out in full, so that of all the codes only what is not zero is ever in memory.
-        asked = np.flatnonzero(selected).astype(np.int32)
-        for some in slices(len(asked), num_classes):
-            out = np.zeros((some.stop - some.start, num_classes), np.float32)
-            means_of(asked[some], out)
-            parts.append(CSRRows.from_dense(out))
-        rows = np.full(len(order), -1)
-        rows[order[asked]] = np.arange(len(asked))
-        return CSRRows.empty(len(order)).replaced(rows, CSRRows.vstack(parts))
-
-    def _prepared(
-        self, codes: CSRRows, weights: np.ndarray, selected: np.ndarray
-    ) -> Callable[[np.ndarray, np.ndarray], None]:
-        """Bring codes and weights into the order of the tree; returns `average` but for its last two arguments."""
-        order = self.tree.order
-        # In the order of the tree, neighbours lie beside each other.
-        ordered, weights = codes.take(order), weights[order]
-        units = np.repeat(weights * np.float32(1 / CODE_UNIT), np.diff(ordered.indptr))
-        np.multiply(units, ordered.data, where=units > 0, out=units)
-        rows, counted = ordered.with_data(np.rint(units, out=units).astype(np.int32)), weights > 0
         self.look_for(selected)
-        empty = nodes_without(counted, len(self.tree.blocks))
         below = np.nextafter(self.radii, np.float32(-np.inf))
-        return partial(average, self.tree, rows, counted, empty, self.radii, below, self.k)
+        asked, parts = np.flatnonzero(selected).astype(np.int32), []
+        for some in slices(len(asked), num_classes):  # of which each has room for rows that are written out in full
+            columns, entries = average(
+                self.tree, leaf_codes, empty, self.radii, below, self.k, asked[some], num_classes
+            )
+            parts.append(CSRRows(starts(columns.counts), columns.joined(), entries.joined()))
+        means = CSRRows.vstack([*parts, CSRRows.empty(1)])
+        del parts, leaf_codes
+        rows = np.full(len(order), len(asked))
+        rows[order[asked]] = np.arange(len(asked))
+        return means.take(rows)
 
 
 def neighbour_weights(known: np.ndarray, evidence: np.ndarray) -> np.ndarray:  # (N,) bool, (N,) px
@@ -146,23 +132,24 @@ def find_neighbours(scene: GaussianScene, k: int) -> None:
 
 @kernel(parallel=True)
 def average(
-    tree: Tree, codes: CSRRows, counted: np.ndarray,  # n rows, int32 in steps of CODE_UNIT; (n,) bool, by place
+    tree: Tree, codes: LeafCodes,
     empty: np.ndarray,  # (2 L,) int32: 1 for nodes of which no point counts
     radii: np.ndarray, below: np.ndarray,  # (n,): squared distance to the k-th nearest other; the next smaller float32
     k: int,
-    places: np.ndarray, out: np.ndarray,  # (M,) int32, ascending; (M, K) float32
-) -> None:  # fmt: skip
-    """Write mean codes of the k nearest others that count; rows of places of which none does stay as they are.
+    places: np.ndarray, num_classes: int,  # (M,) int32, ascending
+) -> tuple[knn.Lists, knn.Lists]:  # fmt: skip
+    """List mean codes of the k nearest others that count: classes, ascending, and float32 above 0; none if none does.
 
     Those exactly at the radius share the places that are left.
     """
-    m, leaves, n, num_classes = len(places), len(tree.blocks), len(tree.order), out.shape[1]
-    skip = np.empty(0, np.int32)
+    m, leaves, n = len(places), len(tree.blocks), len(tree.order)
+    skip, counts = np.empty(0, np.int32), np.zeros(m, np.int64)
+    # Of what has room for rows of all classes, only what is written is ever in memory.
+    columns, entries = np.empty(m * num_classes, np.uint32), np.empty(m * num_classes, np.float32)
     for chunk in nb.prange((m + knn.CHUNK - 1) // knn.CHUNK):
-        sums = np.empty((2, num_classes), np.int64)  # inside the radius, and on it
-        counts = np.empty(2, np.int64)  # the same
+        sums, occurring, masses = np.zeros((num_classes, 2), np.int64), none_of(num_classes), np.empty(num_classes)
         box, candidates = np.empty(6, np.float32), knn.scratch_for(128)
-        begin = chunk * knn.CHUNK
+        begin, last = chunk * knn.CHUNK, chunk * knn.CHUNK * num_classes
         while begin < min((chunk + 1) * knn.CHUNK, m):
             end = knn.end_of_group(tree, places, begin)
             knn.middle_of(tree.points, places, begin, end, box)
@@ -175,37 +162,48 @@ def average(
                 candidates, found = knn.find_leaves(tree.boxes, box, reach, skip, np.int32(0), candidates)
             for q in range(begin, end if found > 0 else begin):
                 own = places[q]
-                sums[:], counts[:] = 0, 0
+                closer = ties = 0
                 for h in range(knn.measure(tree, own, radii[own], found, candidates)):
-                    start = leaf_range(candidates.leaves[candidates.reached[h]], leaves, n)[0]
+                    leaf = candidates.leaves[candidates.reached[h]]
+                    start = leaf_range(leaf, leaves, n)[0]
                     others = ~(1 << (own - start)) if start <= own < start + LEAF else -1
                     near = load_row(candidates.near, h)
                     inside = at_most(near, below[own]) & others
                     tied = at_most(near, radii[own]) & others & ~inside
-                    counts[0] += _add(codes, counted, start, inside, sums[0])
+                    if inside:
+                        add_leaf(codes, leaf, inside, 0, sums, occurring)
+                        closer += count_bits(inside)
                     if tied:
-                        counts[1] += _add(codes, counted, start, tied, sums[1])
+                        add_leaf(codes, leaf, tied, 1, sums, occurring)
+                        ties += count_bits(tied)
                 # The k-th nearest lies on the radius, so that there is always one.
-                share, total = (k - counts[0]) / counts[1], 0.0
-                for c in range(num_classes):
-                    total += sums[0, c] + share * sums[1, c]
-                if total > 0:
-                    for c in range(num_classes):
-                        out[q, c] = (sums[0, c] + share * sums[1, c]) / total
+                counts[q] = _list_means(sums, occurring, masses, (k - closer) / ties, columns[last:], entries[last:])
+                last += counts[q]
             begin = end
+    return knn.Lists(counts, columns), knn.Lists(counts, entries)
 
 
-@nb.njit(inline="always")
-def _add(codes: CSRRows, counted: np.ndarray, start: int, lanes: int, sums: np.ndarray) -> int:
-    """Add up the codes of some points of a leaf, by the bits of their lanes, where they count; tell how many it is."""
-    count = 0
-    while lanes:
-        place = start + first_bit(lanes)
-        lanes &= lanes - 1
-        count += 1
-        if counted[place]:
-            for e in range(codes.indptr[place], codes.indptr[place + 1]):
-                sums[codes.indices[e]] += codes.data[e]
+@called_by_kernels
+def _list_means(
+    sums: np.ndarray, occurring: np.ndarray, masses: np.ndarray,  # scratch; (K,) float64
+    share: float, columns: np.ndarray, entries: np.ndarray,
+) -> int:  # fmt: skip
+    """List sums by their total where they are not zero, those on the radius counting a share; returns how many it is.
+
+    Scratch is all zeros then.
+    """
+    count, total = 0, 0.0
+    for word in range(len(occurring)):
+        while occurring[word]:
+            c = take_first(occurring, word)
+            mass = sums[c, 0] + share * sums[c, 1]
+            sums[c] = 0
+            if mass > 0:
+                columns[count], masses[count] = c, mass
+                total += mass
+                count += 1
+    for j in range(count):
+        entries[j] = masses[j] / total
     return count
 
 
