@@ -20,7 +20,7 @@ from gsseg_core.spatial.row_order import RowOrder
 
 _BITS = 5
 PAGE = 1 << _BITS  # Gaussians of a page
-_NONE, _WANTED = -1, -2  # in place of the number of a page: there is none; one is to be made
+_NONE = -1  # in place of the number of a page: there is none
 
 
 class PairVotes(NamedTuple):
@@ -36,12 +36,19 @@ class VoteTotal:
     """Votes of N Gaussians for K classes, in whole units, int64: what is added can be taken back exactly.
 
     Pages hold the Gaussians in an `order`, by default their own. Nothing but memory and time depends on it.
+
+    Attributes
+    ----------
+    shape : (int, int)
+        N and K.
+    order : RowOrder
     """
 
     def __init__(self, num_gaussians: int, num_classes: int, order: RowOrder | None = None) -> None:
-        self._num_gaussians = num_gaussians
+        self.shape = num_gaussians, num_classes
         self.order = order or RowOrder.own(num_gaussians)
-        self._table = np.full((-(-num_gaussians // PAGE), num_classes), _NONE, np.int32)  # page of a block and class
+        # Page of a class and a block; with rows to spare for classes that are still to come.
+        self._table = np.full((num_classes, -(-num_gaussians // PAGE)), _NONE, np.int32)
         self._pages, self._count = np.zeros((0, PAGE), np.int64), 0  # pages, and how many of them are in use
 
     @classmethod
@@ -52,18 +59,13 @@ class VoteTotal:
         return total
 
     @property
-    def shape(self) -> tuple[int, int]:
-        """N and K."""
-        return self._num_gaussians, self._table.shape[1]
-
-    @property
     def nbytes(self) -> int:
         """Bytes that it takes, besides the order."""
         return self._table.nbytes + self._pages.nbytes
 
     def most_classes(self, nbytes: int) -> int:
         """How many classes there can be, with the votes that there are, in so many bytes; K at least."""
-        return max(self.shape[1], (nbytes - self._pages.nbytes) // (4 * len(self._table)))
+        return max(self.shape[1], (nbytes - self._pages.nbytes) // (4 * self._table.shape[1]))
 
     def add(self, cast: PairVotes, label_votes: CSRRows, units: float, sign: int = 1) -> None:
         """Add the votes of a view, or take them back: `units` per px of weight, a power of 2, `sign` 1 or -1.
@@ -71,20 +73,20 @@ class VoteTotal:
         A pixel of each label votes as the rows `label_votes` say, float64. Where there is too little memory, nothing
         has changed.
         """
-        self._make_pages(_mark_pairs(self._table, self.order.places, cast, label_votes))
+        self._make_pages(_number_pairs(self._table, self.order.places, cast, label_votes, self._count))
         add_pairs(self._table, self.order.places, self._pages.reshape(-1), cast, label_votes, units, sign)
 
     def add_rows(self, rows: CSRRows, first: int = 0) -> None:
         """Add votes in units, int64, to those of consecutive Gaussians from the `first` on."""
-        self._make_pages(_mark_rows(self._table, self.order.places, rows, first))
+        self._make_pages(_number_rows(self._table, self.order.places, rows, first, self._count))
         _add_rows(self._table, self.order.places, self._pages.reshape(-1), rows, first)
 
     def rows(self) -> CSRRows:
         """Return the votes that are not zero."""
-        counts = np.zeros(self._num_gaussians, np.int64)
-        _count(self._table, self.order.order, self._pages, counts)
+        counts, table = np.zeros(self.shape[0], np.int64), self._table[: self.shape[1]]
+        _count(table, self.order.order, self._pages, counts)
         rows = CSRRows.room_for(counts, np.int64)
-        _fill(self._table, self.order.order, self._pages, rows)
+        _fill(table, self.order.order, self._pages, rows)
         return rows
 
     def dense(self) -> np.ndarray:
@@ -94,31 +96,32 @@ class VoteTotal:
     def copy(self) -> VoteTotal:
         """Return another one like it."""
         other = VoteTotal(*self.shape, self.order)
-        other._table[:], other._pages, other._count = self._table, self._pages[: self._count].copy(), self._count
+        other._table[:], other._count = self._table[: self.shape[1]], self._count
+        other._pages = self._pages[: self._count].copy()
         return other
 
     def resize(self, num_classes: int) -> None:
         """Have this many classes; votes for others are gone."""
-        added = max(num_classes - self._table.shape[1], 0)
-        table = np.pad(self._table[:, :num_classes], ((0, 0), (0, added)), constant_values=_NONE)
-        if np.any(self._table[:, num_classes:] != _NONE):
+        table = self._table
+        if num_classes > len(table):
+            table = np.full((max(num_classes, len(table) * 5 // 4), table.shape[1]), _NONE, np.int32)
+            table[: len(self._table)] = self._table
+        if np.any(table[num_classes:] != _NONE):
+            table = table[:num_classes].copy()
             kept = table != _NONE
             self._pages, self._count = self._pages[table[kept]], int(np.count_nonzero(kept))
             table[kept] = np.arange(self._count)
-        self._table = table
+        self._table, self.shape = table, (self.shape[0], num_classes)
 
-    def _make_pages(self, marked: np.ndarray) -> None:  # (blocks,) bool: those where pages are wanted
-        """Make the pages that the table wants; without memory for them, it wants none."""
-        blocks = np.flatnonzero(marked)
-        among, classes = np.nonzero(self._table[blocks] == _WANTED)
-        cells = blocks[among], classes
+    def _make_pages(self, count: int) -> None:
+        """Make room for so many pages, as the table has now; without memory for them, it has none that are new."""
         try:
-            self._make_room(self._count + len(classes))
+            self._make_room(count)
         except BaseException:
-            self._table[cells] = _NONE
+            for pages in self._table:
+                pages[pages >= self._count] = _NONE
             raise
-        self._table[cells] = np.arange(self._count, self._count + len(classes))
-        self._count += len(classes)
+        self._count = count
 
     def _make_room(self, count: int) -> None:
         if count > len(self._pages):
@@ -130,34 +133,45 @@ class VoteTotal:
 @called_by_kernels
 def _cell(table: np.ndarray, place: int, k: int) -> np.int64:
     """Where the votes of the Gaussian at a place for a class are, among those of all pages."""
-    return (np.int64(table[place >> _BITS, k]) << _BITS) | (place & (PAGE - 1))
+    return (np.int64(table[k, place >> _BITS]) << _BITS) | (place & (PAGE - 1))
 
 
 @called_by_kernels
-def _want(table: np.ndarray, block: int, k: int) -> bool:
-    """Want the page of a block and a class, if there is none; threads that do so at once write the same."""
-    if table[block, k] != _NONE:
-        return False
-    table[block, k] = _WANTED
-    return True
+def _next_cell(
+    table: np.ndarray, places: np.ndarray, cast: PairVotes, label_votes: CSRRows, s: int, last: int
+) -> np.int64:
+    """Cell that a pair after pair s will need, of the first class: most labels are of one; ask for the next's place."""
+    gaussians, labels = cast.gaussians, cast.labels
+    prefetch(places, gaussians[min(s + 2 * AHEAD, last)])
+    later = min(s + AHEAD, last)
+    first = label_votes.indptr[labels[later]]
+    column = label_votes.indices[first] if first < len(label_votes.indices) else 0
+    return _cell(table, places[gaussians[later]], column)
 
 
-@kernel(parallel=True)
-def _mark_pairs(table: np.ndarray, places: np.ndarray, cast: PairVotes, label_votes: CSRRows) -> np.ndarray:
+@kernel
+def _number_pairs(
+    table: np.ndarray, places: np.ndarray, cast: PairVotes, label_votes: CSRRows, count: int,  # pages that there are
+) -> int:  # fmt: skip
+    """Give pages to what a view votes for and has none; returns how many there are then.
+
+    One thread does so, as no two may get the same number; it has hardly more to do than to look.
+    """
     gaussians, labels, _, parts = cast
-    marked = np.zeros(table.shape[0], np.bool_)
-    for part in nb.prange(parts.shape[0]):
+    for part in range(parts.shape[0]):
         for s in range(parts[part, 0], parts[part, 1]):
+            prefetch(places, gaussians[min(s + AHEAD, parts[part, 1] - 1)])
             block = places[gaussians[s]] >> _BITS
             for z in range(label_votes.indptr[labels[s]], label_votes.indptr[labels[s] + 1]):
-                if _want(table, block, label_votes.indices[z]):
-                    marked[block] = True
-    return marked
+                if table[label_votes.indices[z], block] == _NONE:
+                    table[label_votes.indices[z], block] = count
+                    count += 1
+    return count
 
 
 @kernel(parallel=True)
 def add_pairs(
-    table: np.ndarray, places: np.ndarray,  # (blocks, K) with a page wherever one is needed; (N,) int32
+    table: np.ndarray, places: np.ndarray,  # (K, blocks) with a page wherever one is needed; (N,) int32
     cells: np.ndarray,  # (pages * PAGE,)
     cast: PairVotes, label_votes: CSRRows, units: float, sign: int,
 ) -> None:  # fmt: skip
@@ -165,26 +179,22 @@ def add_pairs(
     gaussians, labels, weights, parts = cast
     for part in nb.prange(parts.shape[0]):
         for s in range(parts[part, 0], parts[part, 1]):
-            # What is asked for in time is the cell of the first class; most labels are of one.
-            later = min(s + AHEAD, parts[part, 1] - 1)
-            first = label_votes.indptr[labels[later]]
-            column = label_votes.indices[first] if first < len(label_votes.indices) else 0
-            prefetch(cells, _cell(table, places[gaussians[later]], column))
+            prefetch(cells, _next_cell(table, places, cast, label_votes, s, parts[part, 1] - 1))
             for z in range(label_votes.indptr[labels[s]], label_votes.indptr[labels[s] + 1]):
                 added = sign * vote_units(weights[s], label_votes.data[z], units)
                 cells[_cell(table, places[gaussians[s]], label_votes.indices[z])] += added
 
 
-@kernel(parallel=True)
-def _mark_rows(table: np.ndarray, places: np.ndarray, rows: CSRRows, first: int) -> np.ndarray:
+@kernel
+def _number_rows(table: np.ndarray, places: np.ndarray, rows: CSRRows, first: int, count: int) -> int:
     indptr, classes, _ = rows
-    marked = np.zeros(table.shape[0], np.bool_)
-    for i in nb.prange(indptr.shape[0] - 1):
+    for i in range(indptr.shape[0] - 1):
         block = places[first + i] >> _BITS
         for z in range(indptr[i], indptr[i + 1]):
-            if _want(table, block, classes[z]):
-                marked[block] = True
-    return marked
+            if table[classes[z], block] == _NONE:
+                table[classes[z], block] = count
+                count += 1
+    return count
 
 
 @kernel(parallel=True)
@@ -197,12 +207,12 @@ def _add_rows(table: np.ndarray, places: np.ndarray, cells: np.ndarray, rows: CS
 
 @kernel(parallel=True)
 def _count(table: np.ndarray, order: np.ndarray, pages: np.ndarray, counts: np.ndarray) -> None:
-    for block in nb.prange(table.shape[0]):
+    for block in nb.prange(table.shape[1]):
         first = block * PAGE
         size = min(PAGE, counts.shape[0] - first)
-        for k in range(table.shape[1]):
-            if table[block, k] >= 0:
-                page = pages[table[block, k]]
+        for k in range(table.shape[0]):
+            if table[k, block] >= 0:
+                page = pages[table[k, block]]
                 for i in range(size):
                     counts[order[first + i]] += page[i] != 0
 
@@ -210,13 +220,13 @@ def _count(table: np.ndarray, order: np.ndarray, pages: np.ndarray, counts: np.n
 @kernel(parallel=True)
 def _fill(table: np.ndarray, order: np.ndarray, pages: np.ndarray, rows: CSRRows) -> None:
     indptr, classes, votes = rows
-    for block in nb.prange(table.shape[0]):
+    for block in nb.prange(table.shape[1]):
         first = block * PAGE
         size = min(PAGE, indptr.shape[0] - 1 - first)
         nexts = indptr[order[first : first + size]]  # where the next entry of each row goes
-        for k in range(table.shape[1]):
-            if table[block, k] >= 0:
-                page = pages[table[block, k]]
+        for k in range(table.shape[0]):
+            if table[k, block] >= 0:
+                page = pages[table[k, block]]
                 for i in range(size):
                     if page[i] != 0:
                         classes[nexts[i]], votes[nexts[i]] = k, page[i]

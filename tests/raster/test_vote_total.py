@@ -165,7 +165,7 @@ def test_without_memory_for_pages_nothing_changes(monkeypatch: pytest.MonkeyPatc
     with monkeypatch.context() as patch:
         patch.setattr(vote_total.np, "zeros", full)
         with pytest.raises(MemoryError):
-            total._make_pages(vote_total._mark_pairs(total._table, total.order.places, *second))
+            total._make_pages(vote_total._number_pairs(total._table, total.order.places, *second, total._count))
     np.testing.assert_array_equal(total.dense(), before)
     total.add(*second, UNITS)
     np.testing.assert_array_equal(total.dense(), before + dense_votes((600, 7), *second))
