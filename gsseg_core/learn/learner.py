@@ -116,8 +116,10 @@ class Learner(ABC):
         """
         return ()
 
-    def observe(self, view: View) -> bool:
+    def observe(self, view: View, operator: ViewOperator | None = None) -> bool:
         """Add a view and its votes. A view of a name that is there already replaces it.
+
+        The view's `operator` is made here unless it is at hand.
 
         Returns
         -------
@@ -133,11 +135,11 @@ class Learner(ABC):
             view = view.held()  # Nothing else tells which votes were its own, should its file have changed by then.
         if self.memory_budget == 0 and view.name not in self.views:
             try:
-                sees = self._lift(view, read_usable_mask(view, self.num_classes), 1)
+                sees = self._lift(view, read_usable_mask(view, self.num_classes), 1, operator)
             except UnusableViewError as why:
                 return self._add(view, why)
             return self._add(view, None if sees else UnusableViewError(SEES_NOTHING))
-        return self._add(view, self._opened(view))
+        return self._add(view, self._opened(view, operator))
 
     def observe_all(self, views: Sequence[View], progress: Progress = silent) -> None:
         """Add views, as `observe` does; the error that one of them raises ends it."""
@@ -242,15 +244,14 @@ class Learner(ABC):
         """
         if (found := state.votes.num_rows) != len(self.scene):
             raise StateMismatchError(f"state is of {found} Gaussians; expected {len(self.scene)}, as the scene has")
-        order = along_curve(self.scene)
-        votes = VoteTotal.from_rows(state.votes, state.num_classes, order)
+        votes = VoteTotal.from_rows(state.votes, state.num_classes, along_curve(self.scene))
         self._unfit()
         self.views, self._votes = {view.name: view for view in state.views}, votes
         self.num_classes = state.num_classes
         self.rejected.clear()
         self._prepared.clear()
         if state.whole_rays:
-            self._votes = votes_cast_anew(state, self._operator_of, self._used_labels, UNITS, order)
+            self._votes = votes_cast_anew(state, self._operator_of, self._used_labels, UNITS, votes.order)
 
     def vote_codes(self) -> np.ndarray:
         """Votes as probabilities, (N, K) float32; a row of zeros where no labelled pixel saw the Gaussian."""
@@ -304,15 +305,15 @@ class Learner(ABC):
             raise SettingsError(f"view {name!r} was not observed; there are {len(self.views)} others")
         return self.views[name]
 
-    def _lift(self, view: View, seen: SeenLabels, sign: int) -> bool:
+    def _lift(self, view: View, seen: SeenLabels, sign: int, operator: ViewOperator | None = None) -> bool:
         """Add a view's votes, or take them away, and keep nothing of it; tell whether it sees any Gaussian."""
-        operator = self._operator_of(view)
+        operator = operator or self._operator_of(view)
         return operator.vote(*self._used_labels(seen, operator), self._votes, UNITS, sign)
 
-    def _opened(self, view: View) -> Observation | UnusableViewError:
+    def _opened(self, view: View, operator: ViewOperator | None = None) -> Observation | UnusableViewError:
         """Prepare a new view; return the error that says why, where it cannot be used."""
         try:
-            observation = self._prepare(view, read_usable_mask(view, self.num_classes))
+            observation = self._prepare(view, read_usable_mask(view, self.num_classes), operator)
         except UnusableViewError as why:
             return why
         return observation if observation.num_pairs else UnusableViewError(SEES_NOTHING)
@@ -325,12 +326,14 @@ class Learner(ABC):
         total = self._votes if total is None else total
         if opened is not None:  # First: where there is no memory for its votes, the view in whose place it comes stays.
             opened.vote(total, UNITS)
-            try:
-                if view.name in self.views:
-                    self.retract(view.name)
-            except BaseException:
+        try:
+            if view.name in self.views:
+                self.retract(view.name)
+        except BaseException:
+            if opened is not None:
                 opened.vote(total, UNITS, -1)
-                raise
+            raise
+        if opened is not None:
             self._prepared.keep(view.name, opened)
         self.rejected.pop(view.name, None)
         self.views[view.name] = view
@@ -358,8 +361,8 @@ class Learner(ABC):
     def _operator_of(self, view: View) -> ViewOperator:
         return make_operator(self.scene, view.camera, self.device)
 
-    def _prepare(self, view: View, seen: SeenLabels) -> Observation:
-        operator = self._operator_of(view)
+    def _prepare(self, view: View, seen: SeenLabels, operator: ViewOperator | None = None) -> Observation:
+        operator = operator or self._operator_of(view)
         return operator.observe(*self._used_labels(seen, operator))
 
     def _used_labels(self, seen: SeenLabels, operator: ViewOperator) -> SeenLabels:

@@ -42,14 +42,14 @@ class LivingVotes(VoteLearner):
         self.living = living
         self._ends: WeakKeyDictionary[View, np.ndarray] = WeakKeyDictionary()
 
-    def observe(self, view: View) -> bool:
+    def observe(self, view: View, operator: ViewOperator | None = None) -> bool:
         """Add a view and its votes, as `Learner.observe` does; raises `UnknownGroupError`, too."""
         if view.group is not None and view.group not in self.living.frames:
             raise UnknownGroupError(
                 f"view '{view.name}': belongs to group {view.group}, which the scene has not; expected one of its "
                 f"{len(self.living.frames)} groups"
             )
-        return super().observe(view)
+        return super().observe(view, operator)
 
     def in_scene(self, view: View) -> View:
         """Pose a view in the frame of the scene as it is now."""

@@ -21,6 +21,8 @@ from gsseg_core.learn.vote_learner import VoteLearner
 from gsseg_core.live.results import Outcome, Rejection
 from gsseg_core.live.session import LiveSession
 from gsseg_core.objects.object_table import ObjectTable, Repair, object_name
+from gsseg_core.raster.backends import make_operator
+from gsseg_core.raster.view_operator import ViewOperator
 from gsseg_core.raster.vote_total import VoteTotal
 from gsseg_core.scene.camera import Camera
 from gsseg_core.segmentation import Segmentation
@@ -46,10 +48,12 @@ class PerViewSession(LiveSession):
         """Names by number, "object_001" and so on."""
         return {k: object_name(k) for k in range(self._live.num_classes)}
 
-    def _fuse(self, view: View) -> Rejection | None:
+    def _fuse(self, view: View, operator: ViewOperator | None = None) -> Rejection | None:
         undo = self._table.checkpoint()
+        if view.has_mask:  # Made once: its segments are lifted, and then the objects that they are.
+            operator = operator or make_operator(self.scene, view.camera, self.device)
         try:
-            rejection = super()._fuse(self._table.match(view))
+            rejection = super()._fuse(self._table.match(view, operator), operator)
         except BaseException:  # Too little memory is no GssegError.
             undo()
             raise
@@ -64,8 +68,9 @@ class PerViewSession(LiveSession):
                 kept, order = self._live.views[name], list(self._live.views)
                 view = self._table.views.get(name, kept)
                 after = replace(view, camera=moved(view.camera))
-                if self._table.sees_any(after):
-                    self._fuse(after)
+                operator = make_operator(self.scene, after.camera, self.device)
+                if self._table.sees_any(after, operator):
+                    self._fuse(after, operator)
                 else:
                     undo = self._table.checkpoint()
                     try:

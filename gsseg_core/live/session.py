@@ -26,6 +26,7 @@ from gsseg_core.live.living_votes import without_groups
 from gsseg_core.live.results import SCENE_CHANGED, Outcome, Rejection
 from gsseg_core.live.session_classes import SessionClasses
 from gsseg_core.progress import Stopwatch
+from gsseg_core.raster.view_operator import ViewOperator
 from gsseg_core.refine.settings import UNREFINED, RefineSettings
 from gsseg_core.scene.camera import Camera
 from gsseg_core.scene.gaussian_scene import GaussianScene
@@ -165,10 +166,10 @@ class LiveSession:
                 self._live.resize(num_classes)
             return rejection
 
-    def _fuse(self, view: View) -> Rejection | None:
+    def _fuse(self, view: View, operator: ViewOperator | None = None) -> Rejection | None:
         self._grow_for(view)
         repeated = view.name in self._live.views
-        if not self._live.observe(view):
+        if not self._live.observe(view, operator):
             why = self._live.rejected.pop(view.name)
             return self.reject(Rejection(why.replace(" ", "_"), f"view '{view.name}': {why}"))
         self.num_fused += not repeated
@@ -242,10 +243,7 @@ class LiveSession:
     def codes(self) -> np.ndarray:
         """Class probabilities of every Gaussian as they are now, (N, K) float32; a row of zeros where nothing is known.
 
-        Raises
-        ------
-        NoCodesError
-            Nothing has been fused or learnt yet.
+        Raises `NoCodesError` where nothing has been fused or learnt yet.
         """
         with self._lock:
             return self._code_rows().dense(self._live.num_classes)

@@ -87,29 +87,29 @@ class ObjectTable:
         """Names by number, up to the largest that was given: "object_001" and so on."""
         return {k: object_name(k) for k in range(self._largest + 1)}
 
-    def add(self, view: View) -> bool:
+    def add(self, view: View, operator: ViewOperator | None = None) -> bool:
         """Add a view for `solve`; one of a name that is there already replaces it.
 
-        Tells whether it has a mask and sees any Gaussian; if not, nothing has changed. Raises `MaskFormatError`,
-        `MaskSizeError` or `UnknownLabelError` where the mask is broken, of another size than the camera, or has ids
-        beyond `MAX_LABEL`.
+        The view's `operator` is made here unless it is at hand. Tells whether the view has a mask and sees any
+        Gaussian; if not, nothing has changed. Raises `MaskFormatError`, `MaskSizeError` or `UnknownLabelError` where
+        the mask is broken, of another size than the camera, or has ids beyond `MAX_LABEL`.
         """
-        return self._add(view, self._lift(view))
+        return self._add(view, self._lift(view, operator))
 
     def add_all(self, views: Sequence[View], progress: Progress = silent) -> None:
         """Add views, as `add` does; the error that one of them raises ends it."""
         for view, lifted in each_with_made(self._lift, views, self.device, progress, "lift"):
             self._add(view, lifted)
 
-    def match(self, view: View) -> View:
+    def match(self, view: View, operator: ViewOperator | None = None) -> View:
         """Add a view, and give its ids the numbers of the objects so far; what nobody has seen yet is a new object.
 
-        Returns what `relabelled` does. Raises as `add` does, and where there are too many objects; then nothing has
-        changed.
+        Returns what `relabelled` does. Takes and raises what `add` does, and raises where there are too many objects;
+        then nothing has changed.
         """
         undo = self.checkpoint()
         try:
-            if not self.add(view):
+            if not self.add(view, operator):
                 return _without_labels(view)
             lifted = self._lifted[view.name]
             best, seen = self._profiles.explain(lifted)
@@ -183,9 +183,9 @@ class ObjectTable:
         """Whether a view counts: it was not set aside."""
         return name in self._lifted
 
-    def sees_any(self, view: View) -> bool:
-        """Whether a view has a mask and sees any Gaussian."""
-        return self._lift(view) is not None
+    def sees_any(self, view: View, operator: ViewOperator | None = None) -> bool:
+        """Whether a view has a mask and sees any Gaussian; takes what `add` does."""
+        return self._lift(view, operator) is not None
 
     def set_aside(self, view: View) -> None:
         """Keep a view that sees nothing for now; what was known from it is taken back."""
@@ -288,9 +288,9 @@ class ObjectTable:
             raise SettingsError(f"view {name!r} was added, and its objects are not known yet; expected solve() first")
         return self._objects[name]
 
-    def _lift(self, view: View) -> Lifted | None:
+    def _lift(self, view: View, operator: ViewOperator | None = None) -> Lifted | None:
         """Lift the segments of a view to the Gaussians; None where it has no labels or sees no Gaussian."""
-        opened = self._open(view)
+        opened = self._open(view, operator)
         if opened is None:
             return None
         operator, labels = opened
@@ -299,13 +299,15 @@ class ObjectTable:
             return None
         return Lifted.of_weights(seen, self.settings.kept).bordered(self.scene, operator, labels)
 
-    def _open(self, view: View) -> tuple[ViewOperator, np.ndarray] | None:
-        """Make the operator of a view, and read its labels; None where it has none."""
+    def _open(self, view: View, operator: ViewOperator | None = None) -> tuple[ViewOperator, np.ndarray] | None:
+        """Make the operator of a view unless it is at hand, and read its labels; None where it has none."""
         if not view.has_mask:
             return None
         # Names of classes say nothing of ids that are a view's own.
         labels = replace(view, class_names=None).read_labels()
-        return (make_operator(self.scene, view.camera, self.device), labels) if (labels >= 0).any() else None
+        if not (labels >= 0).any():
+            return None
+        return operator or make_operator(self.scene, view.camera, self.device), labels
 
     def _add(self, view: View, lifted: Lifted | None) -> bool:
         if lifted is None:

@@ -45,7 +45,7 @@ def test_views_beyond_the_memory_budget_are_prepared_once_and_memory_does_not_gr
     prepared, peaks, largest = 0, [], 0
     prepare = EMLearner._prepare
 
-    def counted(learner: EMLearner, view: View, seen: SeenLabels) -> Observation:
+    def counted(learner: EMLearner, view: View, seen: SeenLabels, operator: object = None) -> Observation:
         nonlocal prepared, largest
         prepared += 1
         observation = prepare(learner, view, seen)

@@ -314,7 +314,7 @@ def test_names_of_classes_are_told_while_a_view_is_being_fused(monkeypatch: pyte
     session = LiveSession(balls_on_a_table()[0], NAMES)
     begun, told, in_time = threading.Event(), threading.Event(), []
 
-    def observe(learner: object, view: object) -> bool:
+    def observe(learner: object, view: object, operator: object) -> bool:
         begun.set()
         in_time.append(told.wait(PATIENCE))
         return True

@@ -28,6 +28,7 @@ from gsseg_core.learn.em.em_learner import EMLearner
 from gsseg_core.learn.learner import Learner, Progress, silent
 from gsseg_core.learn.usable_views import UnusableViewError
 from gsseg_core.learn.vote_learner import VoteLearner
+from gsseg_core.raster.view_operator import ViewOperator
 from gsseg_core.scene.gaussian_scene import GaussianScene
 
 if TYPE_CHECKING:
@@ -61,8 +62,8 @@ class _OnWorkers(Learner):
         self._dealt: tuple[dict[str, int], int] = {}, 0
         self._direct = True
 
-    def observe(self, view: View) -> bool:
-        """Add a view and its votes."""
+    def observe(self, view: View, operator: ViewOperator | None = None) -> bool:
+        """Add a view and its votes; workers make operators of their own."""
         self.observe_all([view])
         return view.name not in self.rejected
 

@@ -261,8 +261,8 @@ class EMLearner(Learner):
             raise SettingsError(f"view {view.name!r} was not learnt from; expected a view of the last fit()")
         return self.error_models_[view.name]
 
-    def _prepare(self, view: View, seen: SeenLabels) -> Observation:
-        operator = self._operator_of(view)
+    def _prepare(self, view: View, seen: SeenLabels, operator: ViewOperator | None = None) -> Observation:
+        operator = operator or self._operator_of(view)
         used = self._used_labels(seen, operator)
         # Without error models, what is wrong in few pixels would weigh too much: up to a point of mIoU was lost by it.
         weights = block_weights(used.labels, seen.hardened().labels) if self.settings.errors else None
