@@ -173,7 +173,7 @@ def refine_something(device: str = "cpu") -> None:
     propagate(graph_of(scene), codes, np.zeros(len(codes)))
     result = Segmentation.from_codes(scene, codes, {0: "left", 1: "right"}, PAPER).carved(scene, [camera])
     operator = make_operator(scene, camera, device)
-    result.render(operator)
+    result.calibrated(2.0).render(operator)
     operator.render(scene.colors(camera.center))
     overlay(np.zeros((*labels.shape, 3), np.uint8), labels, palette(2))
     reordered(scene, curve_order(scene.means))
