@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-import os
 from collections.abc import Callable, Mapping
 from dataclasses import replace
 from functools import reduce
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -158,32 +156,26 @@ class PerViewSession(LiveSession):
         self.repair()
         return super().learn(learner, None, **settings)
 
-    def load(self, path: str | os.PathLike[str], within: Path | None = None) -> int:
-        """Replace all that is known by a saved state, as `LiveSession.load` does; its labels are numbers of objects."""
-        with self._lock:
-            loaded = super().load(path, within)
-            if self.num_fused > self.num_views:
-                self._recall_dropped_views()
-            else:
-                self._table.adopt_all(list(self._live.views.values()))
-            self._table.reserve(self._live.num_classes - 1)
-        return loaded
-
-    def _recall_dropped_views(self) -> None:
-        """Have the table know the views that are kept; votes left are of dropped ones: what these showed is not new."""
-        known = self._live.state()
-        votes = VoteTotal.from_rows(known.votes, known.num_classes, along_curve(self.scene))
-        for view in self._live.views.values():
-            if observation := self._table.adopt(view):
-                observation.vote(votes, UNITS, -1)
-        rest = votes.rows()
-        self._table.recall(rest.with_data(rest.data * VOTE_UNIT))
-
-    def _forget(self, class_names: Mapping[int, str], votes: VoteLearner) -> None:
-        super()._forget(class_names, votes)
-        self._table = ObjectTable(self.scene, device=self.device)
-        self._with_tree = None
+    def _forget(self, class_names: Mapping[int, str], votes: VoteLearner, num_fused: int = 0) -> None:
+        table = self._table_of(votes, num_fused)  # First: with too little memory for it, nothing is forgotten.
+        super()._forget(class_names, votes, num_fused)
+        self._table, self._with_tree = table, None
         self._repairs: list[np.ndarray] = []  # successors of each repair that gave objects other numbers
+
+    def _table_of(self, votes: VoteLearner, num_fused: int) -> ObjectTable:
+        """Make the table of views whose labels are numbers of objects, and of the votes of those that were dropped."""
+        table, views = ObjectTable(self.scene, device=self.device), list(votes.views.values())
+        if num_fused > len(views):  # The votes left are of dropped views: what these showed is not new.
+            left = VoteTotal.from_rows(votes.state().votes, votes.num_classes, along_curve(self.scene))
+            for view in views:
+                if observation := table.adopt(view):
+                    observation.vote(left, UNITS, -1)
+            rest = left.rows()
+            table.recall(rest.with_data(rest.data * VOTE_UNIT))
+        else:
+            table.adopt_all(views)
+        table.reserve(votes.num_classes - 1)
+        return table
 
     def _carrier(self) -> Callable[[Learnt], Learnt]:
         repaired = len(self._repairs)

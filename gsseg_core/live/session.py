@@ -331,10 +331,11 @@ class LiveSession:
         votes = self._no_votes(state.num_classes)
         votes.adopt(state)  # To cast votes of old anew takes long.
         votes.resize(max(state.num_classes, self._classes.least))  # Out of memory here, nothing is forgotten.
+        for name in list(votes.views)[: -self.max_views]:
+            votes.forget(name)
         with self._lock:
-            self._forget(state.class_names, votes)
-            self.num_fused, self._learnt = state.num_fused, state.learnt
-            self._drop_old_views()
+            self._forget(state.class_names, votes, state.num_fused)
+            self._learnt = state.learnt
         return state.learnt.num_views if state.learnt is not None else state.num_fused
 
     def prepare(self, settings: RefineSettings) -> None:
@@ -358,10 +359,10 @@ class LiveSession:
             self._forget({}, self._no_votes(self._classes.least))
         return dropped
 
-    def _forget(self, class_names: Mapping[int, str], votes: VoteLearner) -> None:
+    def _forget(self, class_names: Mapping[int, str], votes: VoteLearner, num_fused: int = 0) -> None:
         """Replace all that is known by names of classes and the votes of a state, or of none."""
         self._classes.reset(class_names)
-        self._live, self._cameras, self.num_fused = votes, [], 0
+        self._live, self._cameras, self.num_fused = votes, [], num_fused
         self._learnt = self._segmented = None
         self._version += 1
         self.retire()

@@ -197,7 +197,8 @@ class ObjectTable:
         """Drop a view; its evidence still counts for `match`, but no longer for `solve`. Raises as `remove` does."""
         self._require(name)
         if name in self._lifted:
-            self._forgotten.add(self._lifted.pop(name), self._objects.pop(name))
+            self._forgotten.add(self._lifted[name], self._objects[name])
+            del self._lifted[name], self._objects[name]
         del self.views[name]
 
     def solve(self, progress: Progress = silent) -> Repair:

@@ -273,6 +273,30 @@ def test_a_repair_that_finds_too_many_objects_changes_nothing() -> None:
     assert session.repair().changed, "which has not been done yet"
 
 
+@pytest.mark.parametrize(("max_views", "starved"), [(9, "adopt_all"), (2, "adopt"), (2, "recall")])
+def test_a_state_that_there_is_no_memory_for_changes_nothing(
+    max_views: int, starved: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def without_memory(*_: object) -> None:
+        raise MemoryError
+
+    saved, session = PerViewSession(SCENE, max_views=max_views), PerViewSession(SCENE)
+    for view in VIEWS[:4]:
+        assert saved.fuse(shuffled(view)) is None
+    saved.save(tmp_path / "state.npz")
+    for view in VIEWS[4:6]:
+        assert session.fuse(shuffled(view)) is None
+    before, era = session.codes(), session.era
+    with monkeypatch.context() as patch, pytest.raises(MemoryError):
+        patch.setattr(ObjectTable, starved, without_memory)
+        session.load(tmp_path / "state.npz")
+    np.testing.assert_array_equal(session.codes(), before)
+    assert session.era is era and session.num_fused == 2 and list(session._table.views) == session.view_names
+    assert session.fuse(shuffled(VIEWS[6])) is None
+    assert session.load(tmp_path / "state.npz") == 4
+    np.testing.assert_array_equal(session.codes(), saved.codes())
+
+
 def test_an_object_that_only_views_show_that_are_gone_keeps_its_number_after_loading(tmp_path: Path) -> None:
     session = PerViewSession(SCENE, max_views=2)
     for view in [*VIEWS[:3], *(without(view, 1) for view in VIEWS[3:6])]:
