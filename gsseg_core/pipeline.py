@@ -38,10 +38,9 @@ from gsseg_core.scene.gaussian_scene import GaussianScene
 from gsseg_core.scene.scene_writers import DEFAULT as DEFAULT_FORMAT
 from gsseg_core.segmentation import Segmentation
 from gsseg_core.spatial.neighbour_graph import graph_of
-from gsseg_core.spatial.row_order import curve_order, inverse, reordered
+from gsseg_core.spatial.row_order import in_curve_order
 
 if TYPE_CHECKING:
-    import numpy as np
     from distributed import Client
 
 PICTURED_VIEWS = 12  # views that `segment` draws, spread evenly over the dataset
@@ -138,7 +137,7 @@ def segment(
                 )
             with watch.stage("load"):
                 # Workers find the scene in files of their own, in the order that it has there.
-                inputs = _inputs(scene, curve_order(scene.means) if client is None else None, placed, settings)
+                inputs = _inputs(scene, placed, settings, ordered=client is None)
                 del scene
             if settings.ids == PER_VIEW:
                 with watch.stage("associate"):
@@ -189,7 +188,7 @@ def _connect(scheduler: str | None, workers: ExitStack) -> Client | None:
     return workers.enter_context(connected(scheduler))
 
 
-def _inputs(scene: GaussianScene, order: np.ndarray | None, placed: Placed, settings: RunSettings) -> Inputs:
+def _inputs(scene: GaussianScene, placed: Placed, settings: RunSettings, *, ordered: bool) -> Inputs:
     """List the views to learn from and to draw, with classes numbered without gaps; bring the scene into an order."""
     dataset = placed.dataset
     # Ids that are a view's own are no classes; objects take their place.
@@ -200,9 +199,9 @@ def _inputs(scene: GaussianScene, order: np.ndarray | None, placed: Placed, sett
     looked_at = spread(train, settings.refine.carve_views)
     enough = settings.refine.carve and len(looked_at) >= PICTURED_VIEWS
     pictured = spread(looked_at if enough else dataset.views("all"), PICTURED_VIEWS)
-    ordered, places = (scene, None) if order is None else (reordered(scene, order), inverse(order))
+    in_order, places = in_curve_order(scene) if ordered else (scene, None)
     return Inputs(
-        ordered, scene.digest, places, dataset.root, train, looked_at, pictured,
+        in_order, scene.digest, places, dataset.root, train, looked_at, pictured,
         {} if class_ids is None else dataset.class_names, class_ids, placed.as_dict(), dataset.describe_masks(),
     )  # fmt: skip
 

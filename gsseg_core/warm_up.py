@@ -41,7 +41,7 @@ from gsseg_core.scene.harmonics_kernel import seen_colors
 from gsseg_core.scene.spherical_harmonics import basis
 from gsseg_core.segmentation import Segmentation
 from gsseg_core.spatial.neighbour_graph import graph_of
-from gsseg_core.spatial.row_order import curve_order, reordered
+from gsseg_core.spatial.row_order import in_curve_order
 
 FIRST_RUN = "compiling kernels, about a minute on two cores; only the first run after installing does this"
 EVERY_RUN = (
@@ -176,7 +176,7 @@ def refine_something(device: str = "cpu") -> None:
     result.calibrated(2.0).render(operator)
     operator.render(scene.colors(camera.center))
     overlay(np.zeros((*labels.shape, 3), np.uint8), labels, palette(2))
-    reordered(scene, curve_order(scene.means))
+    in_curve_order(scene)
     # What only some inputs need: soft masks, partial ones, and colours that are not of a PLY.
     quantise(np.stack([labels == 0, labels == 1]).astype(np.float32))
     rows = CSRRows.from_dense(codes)

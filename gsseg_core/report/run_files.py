@@ -37,7 +37,7 @@ class Inputs:
 
     scene: GaussianScene
     digest: str  # of the scene as it is in its file
-    places: np.ndarray | None  # (N,) int64 in this scene of the Gaussians in that order; None where it is the same
+    places: np.ndarray | None  # (N,) int32 in this scene of the Gaussians in that order; None where it is the same
     root: Path  # of the dataset
     train: list[View]
     looked_at: list[View]  # of these, to carve objects by

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from functools import partial
 from typing import Any, NamedTuple
 
 import numba as nb
@@ -42,6 +43,14 @@ def along_curve(scene: GaussianScene) -> RowOrder:
         return RowOrder(order, inverse(order))
 
     return _KNOWN.of(scene, found)
+
+
+def in_curve_order(scene: GaussianScene) -> tuple[GaussianScene, np.ndarray]:
+    """Give a scene whose Gaussians lie `along_curve`, and the place of each of this one's in it, (N,) int32."""
+    order, places = along_curve(scene)
+    ordered = reordered(scene, order)
+    _KNOWN.of(ordered, partial(RowOrder.own, len(scene)))
+    return ordered, places
 
 
 def curve_order(means: np.ndarray) -> np.ndarray:
@@ -86,7 +95,7 @@ def inverse(order: np.ndarray) -> np.ndarray:  # (N,) integers
 
 
 def reordered(scene: GaussianScene, order: np.ndarray) -> GaussianScene:
-    """Give a scene whose Gaussian i is Gaussian order[i], (N,) int64, of this one, as `GaussianScene.subset` does."""
+    """Give a scene whose Gaussian i is Gaussian order[i] of this one, (N,) integers, as `GaussianScene.subset` does."""
     records = scene.vertices
     arrays: dict[str, Any] = {
         name: take_rows(getattr(scene, name).reshape(len(scene), -1), order) for name in ACTIVATED

@@ -10,7 +10,15 @@ from numpy.lib import recfunctions
 from small_scenes import balls_on_a_table
 
 from gsseg_core.scene.gaussian_scene import GaussianScene
-from gsseg_core.spatial.row_order import along_curve, curve_order, reordered, rows_by_label, take_rows
+from gsseg_core.spatial import row_order
+from gsseg_core.spatial.row_order import (
+    along_curve,
+    curve_order,
+    in_curve_order,
+    reordered,
+    rows_by_label,
+    take_rows,
+)
 
 
 def cell_number(x: int, y: int, z: int) -> int:
@@ -55,6 +63,16 @@ def test_the_order_of_a_scene_is_that_of_its_means_and_is_found_once() -> None:
     np.testing.assert_array_equal(order[places], np.arange(len(scene)))
     assert order.dtype == places.dtype == np.int32
     assert along_curve(scene) is found and along_curve(scene.subset(np.arange(9))) is not found
+
+
+def test_a_scene_that_was_brought_into_the_order_is_not_ordered_again(monkeypatch: pytest.MonkeyPatch) -> None:
+    scene, _ = balls_on_a_table()
+    ordered, places = in_curve_order(scene)
+    np.testing.assert_array_equal(ordered.means[places], scene.means)
+    assert ordered.digest == reordered(scene, along_curve(scene).order).digest
+    monkeypatch.delattr(row_order, "curve_order")
+    for own in along_curve(ordered):
+        np.testing.assert_array_equal(own, np.arange(len(scene)))
 
 
 @pytest.mark.parametrize("added", [None, "u1", "<f8"], ids=["floats", "odd bytes", "doubles"])
