@@ -51,6 +51,28 @@ def test_the_strongest_class_is_the_same_where_blending_ends_early(backend, othe
         np.testing.assert_allclose(found.beside.transmittance, left_over, atol=1e-7)
 
 
+@pytest.mark.parametrize("background", [True, False])
+@pytest.mark.parametrize("first", [0, 1])
+def test_of_hundreds_of_classes_each_place_has_a_few(backend, first, background):
+    scene, camera = random_view(7, 400, 57, 41)
+    operator, rng = backend.make(scene, camera), np.random.default_rng(7)
+    # Those beside each other in the image are of a few classes, which come in any order; the first one may be of none.
+    near = first + (scene.means[:, 0].argsort().argsort() * 293) // len(scene)
+    codes = np.zeros((len(scene), 300), np.float32)
+    for shift in rng.permutation(5):
+        codes[np.arange(len(scene)), near + shift] = rng.random(len(scene)) / 5
+    image = np.concatenate([operator.blend(codes[:, k : k + 4])[0] for k in range(0, 300, 4)], axis=2)
+    rendered, left_over = operator.blend_rows(CSRRows.from_dense(codes), 300)
+    np.testing.assert_allclose(rendered, image, atol=1e-6)
+    image[..., 0] += left_over if background else 0
+    found = operator.strongest(CSRRows.from_dense(codes), 300, background, PixelGrid(1, 3))
+    ranked = np.sort(image, axis=2)
+    sure = (ranked[..., -1] - ranked[..., -2] > 1e-5) | (ranked[..., -1] == 0)
+    assert sure.mean() > 0.9
+    np.testing.assert_array_equal(found.classes[sure], image.argmax(axis=2)[sure])
+    np.testing.assert_allclose(found.on_grid, image[1::3, 1::3], atol=1e-6)
+
+
 @pytest.mark.parametrize("others", [1, 4])
 def test_what_is_blended_beside_the_strongest_class_is_what_is_blended_alone(backend, others):
     scene, camera = random_view(others, 150, 37, 21)

@@ -67,10 +67,17 @@ def render(tiles: Tiles, codes: CSRRows, rows: np.ndarray, channels: int) -> tup
     stride = stride_of(tiles.rows)
     for turn in nb.prange(tiles.rows * tiles.columns):
         tile = tile_of_turn(turn, tiles.columns, tiles.rows, stride)
-        values, rays = np.zeros((TILE, channels, TILE), np.float32), np.empty((TILE, TILE), np.float32)
-        others = np.empty((TILE, 0, TILE), np.float32)
-        _blend_codes(tiles, tile, codes, rows, nothing_else, OPEN, 0, values, others, rays)
-        _put(tiles, tile, values, rays, out, left_over)
+        others, rays = np.empty((TILE, 0, TILE), np.float32), np.empty((TILE, TILE), np.float32)
+        values, slots = _blend_codes(tiles, tile, codes, rows, channels, nothing_else, OPEN, 0, others, rays)
+        columns, (left, top) = np.flatnonzero(slots >= 0), corner_of(tiles, tile)
+        for r in range(min(TILE, tiles.height - top)):
+            for c in range(min(TILE, tiles.width - left)):
+                b, lane = in_block(r, c)
+                left_over[top + r, left + c] = rays[b, lane]
+                pixel = out[top + r, left + c]
+                pixel[:] = 0
+                for k in columns:
+                    pixel[k] = values[slots[k] * TILE + b, lane]
     return out, left_over
 
 
@@ -99,12 +106,12 @@ def strongest(
         looked_at = blocks_with(wanted, left, top) if wanted.size else OPEN
         if not looked_at:
             continue
-        values, rays = np.zeros((TILE, channels, TILE), np.float32), np.empty((TILE, TILE), np.float32)
-        others = np.zeros((TILE, beside.shape[1], TILE), np.float32)
+        others, rays = np.zeros((TILE, beside.shape[1], TILE), np.float32), np.empty((TILE, TILE), np.float32)
         best, known = np.zeros((TILE, TILE), np.int32), np.empty((TILE, TILE), np.float32)
         ending = OPEN & ~_blocks_of_grid(first, step, left, top)
-        _blend_codes(tiles, tile, codes, rows, beside, looked_at, ending, values, others, rays)
-        _compare(values, rays, background, best, known)
+        values, slots = _blend_codes(tiles, tile, codes, rows, channels, beside, looked_at, ending, others, rays)
+        columns = np.flatnonzero(slots >= 0)
+        _compare(values, slots, columns, rays, background, best, known)
         _put(tiles, tile, others, rays, image, left_over)
         for r in range(min(TILE, tiles.height - top)):
             for c in range(min(TILE, tiles.width - left)):
@@ -114,8 +121,8 @@ def strongest(
             for c in range((first - left) % step, min(TILE, tiles.width - left), step):
                 if top + r >= first and left + c >= first:
                     b, lane = in_block(r, c)
-                    for k in range(channels):
-                        some[(top + r) // step, (left + c) // step, k] = values[b, k, lane]
+                    for k in columns:
+                        some[(top + r) // step, (left + c) // step, k] = values[slots[k] * TILE + b, lane]
                     some[(top + r) // step, (left + c) // step, 0] += rays[b, lane] if background else np.float32(0)
     return out, half, some, image, left_over
 
@@ -134,15 +141,14 @@ def _blocks_of_grid(first: int, step: int, left: int, top: int) -> int:
 
 
 @nb.njit(inline="always")
-def _is_decided(values: np.ndarray, b: int, rays: np.ndarray, live: int) -> bool:  # (16, K, 16), (16, 16)
+def _is_decided(values: np.ndarray, count: int, b: int, rays: np.ndarray, live: int) -> bool:  # (16 K, 16); (16, 16)
     """Tell whether nothing that rays of a block meet yet changes the largest column, or that more than half is known.
 
     Rays that are not `live`, by the bits of their lanes, meet nothing.
     """
-    channels = values.shape[1]
-    most, second, known = load_row(values, b * channels), zero_row(), load_row(values, b * channels)
-    for k in range(b * channels + 1, (b + 1) * channels):
-        value = load_row(values, k)
+    most, second, known = zero_row(), zero_row(), zero_row()
+    for slot in range(count):
+        value = load_row(values, slot * TILE + b)
         second, most = maximum(second, minimum(most, value)), maximum(most, value)
         known = add_scaled(known, value, np.float32(1))
     ahead = above(add_scaled(most, second, np.float32(-1)), load_row(rays, b), _ROUNDING)
@@ -151,36 +157,43 @@ def _is_decided(values: np.ndarray, b: int, rays: np.ndarray, live: int) -> bool
 
 @called_by_kernels
 def _compare(
-    values: np.ndarray, rays: np.ndarray, background: bool,  # (16, K, 16), (16, 16)
+    values: np.ndarray, slots: np.ndarray, columns: np.ndarray,  # as `_blend_codes` returns them; (S,) that occur
+    rays: np.ndarray, background: bool,  # (16, 16)
     best: np.ndarray, known: np.ndarray,  # (16, 16) in: zeros, out: column of the largest; (16, 16) out: sum of all
 ) -> None:  # fmt: skip
     """Find the strongest column of each pixel of a tile; what is left over of a ray counts to the background."""
     most = np.empty(TILE, np.float32)
     for b in range(TILE):
         for lane in range(TILE):
-            most[lane] = values[b, 0, lane] + (rays[b, lane] if background else np.float32(0))
+            most[lane] = rays[b, lane] if background else np.float32(0)
+            if slots[0] >= 0:
+                most[lane] += values[slots[0] * TILE + b, lane]
             known[b, lane] = most[lane]
-        for k in range(1, values.shape[1]):
+        for k in columns[int(slots[0] >= 0) :]:
+            row = values[slots[k] * TILE + b]
             for lane in range(TILE):  # without a branch, so that the compiler takes the lanes together
-                value = values[b, k, lane]
-                known[b, lane] += value
-                best[b, lane] = np.int32(k) if value > most[lane] else best[b, lane]
-                most[lane] = max(value, most[lane])
+                known[b, lane] += row[lane]
+                best[b, lane] = np.int32(k) if row[lane] > most[lane] else best[b, lane]
+                most[lane] = max(row[lane], most[lane])
 
 
 @called_by_kernels(fastmath={"contract"}, error_model="numpy")
 def _blend_codes(
-    tiles: Tiles, tile: int, codes: CSRRows, rows: np.ndarray, beside: np.ndarray,  # as `strongest` takes them
+    tiles: Tiles, tile: int, codes: CSRRows, rows: np.ndarray, channels: int, beside: np.ndarray,  # as `strongest`'s
     looked_at: int, ending: int,  # bits of blocks: of all that count; of those whose largest column alone is wanted
-    values: np.ndarray, others: np.ndarray, rays: np.ndarray,  # (16, K, 16), (16, C, 16) in: zeros; (16, 16) out
-) -> None:  # fmt: skip
+    others: np.ndarray, rays: np.ndarray,  # (16, C, 16) in: zeros, by block; (16, 16) out
+) -> tuple[np.ndarray, np.ndarray]:  # fmt: skip
     """Blend the codes of a tile, and others beside them; weights are used where they are made.
 
-    Blocks come first, as in the final transmittances, `rays`.
+    Of hundreds of columns, a tile has a few: those get a slot, in the order in which they turn up. Returns the blended
+    codes, (16 K, 16) float32, of which slot s has rows 16 s to 16 s + 15, by block; and the slot of each column, (K,)
+    int64, -1 where there is none. Blocks come first in the final transmittances, `rays`, too.
     """
-    last, channels, (indptr, indices, data) = tiles.start[tile + 1], values.shape[1], codes
-    lines = np.empty((2, 2, TILE), np.float32)
-    turns, patience = np.zeros(TILE, np.int64), 6 + channels // 4  # the more there is to look through, the less often
+    last, (indptr, indices, data) = tiles.start[tile + 1], codes
+    # There is room for all, but memory is only what is written to.
+    values, slots, count = np.empty((channels * TILE, TILE), np.float32), np.full(channels, -1), 0
+    places = np.empty(channels, np.int64)  # where the slots of a Gaussian's columns begin
+    lines, turns = np.empty((2, 2, TILE), np.float32), np.zeros(TILE, np.int64)
     left, top, inside = open_rays(tiles, tile, rays)
     live = inside & looked_at
     wanted, ahead = live, aim_next(tiles, tiles.start[tile] - 1, last, left, top, lines)
@@ -196,6 +209,12 @@ def _blend_codes(
             prefetch(indices, later)
             prefetch(data, later)
         first, end = (indptr[rows[g]], indptr[rows[g] + 1]) if wanted & reached else (0, 0)
+        for z in range(first, end):
+            if slots[indices[z]] < 0:
+                values[count * TILE : (count + 1) * TILE] = 0
+                slots[indices[z]] = count
+                count += 1
+            places[z - first] = slots[indices[z]] * TILE
         ahead = aim_next(tiles, e, last, left, top, lines)
         while reached:
             b = first_bit(reached)
@@ -203,12 +222,12 @@ def _blend_codes(
             weight, bits = blend_block(rays, b, own, wide)
             if wanted >> b & 1:
                 for z in range(first, end):
-                    k = np.int64(b) * channels + np.int64(indices[z])
-                    store_row(values, k, add_scaled(load_row(values, k), weight, data[z]))
+                    row = places[z - first] + b
+                    store_row(values, row, add_scaled(load_row(values, row), weight, data[z]))
                 turns[b] += ending >> b & 1
-                if turns[b] == patience:
+                if turns[b] >= 6 + count // 4:  # The more there is to look through, the less often.
                     turns[b] = 0
-                    if _is_decided(values, b, rays, bits):
+                    if _is_decided(values, count, b, rays, bits):
                         wanted &= ~(1 << b)
                         live &= wanted if beside.shape[1] == 0 else live
             for c in range(beside.shape[1]):
@@ -217,7 +236,8 @@ def _blend_codes(
             if not bits & OPEN:
                 live &= ~(1 << b)
         if not live:
-            return
+            break
+    return values, slots
 
 
 @kernel(parallel=True, fastmath={"contract"}, error_model="numpy")
