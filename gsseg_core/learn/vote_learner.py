@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 
 from gsseg_core.data.view import View
-from gsseg_core.learn.learner import UNITS, Learner, Progress, silent
+from gsseg_core.learn.learner import Learner, Progress, silent
 from gsseg_core.learn.usable_views import read_mask
 from gsseg_core.scene.camera import Camera
 
@@ -49,9 +49,14 @@ class VoteLearner(Learner):
         On any error, nothing has changed.
         """
         before, view = self._observed(view.name), view.held()
-        masks, operator = [read_mask(each, self.num_classes) for each in (view, before)], self._operator_of(view)
-        for mask, sign in zip(masks, (1, -1), strict=True):
-            operator.vote(*self._used_labels(mask, operator), self._votes, UNITS, sign)
+        after, earlier = (read_mask(each, self.num_classes) for each in (view, before))
+        operator = self._operator_of(view)
+        self._lift(view, after, 1, operator)
+        try:
+            self._lift(before, earlier, -1, operator)
+        except BaseException:  # Too little memory.
+            self._lift(view, after, -1, operator)
+            raise
         self.views[view.name] = view
         self._prepared.drop(view.name)
 

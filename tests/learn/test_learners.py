@@ -6,6 +6,7 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -112,6 +113,25 @@ def test_a_view_with_other_labels_has_their_votes_and_no_others(memory_budget: i
             learner.relabel(View.from_arrays(VIEWS[0].camera, mask))
     np.testing.assert_array_equal(learner._votes.dense(), before)
     assert learner.views[VIEWS[0].name] is others[0]
+
+
+def test_a_view_keeps_its_votes_where_there_is_no_memory_to_take_them_back(monkeypatch: pytest.MonkeyPatch) -> None:
+    learner, lift = taught(VoteLearner(SCENE, NUM_CLASSES), VIEWS), VoteLearner._lift
+    before, view = learner._votes.dense(), VIEWS[0]
+
+    def starved(self: VoteLearner, given: View, *rest: Any) -> bool:
+        if given is view:
+            raise MemoryError
+        return lift(self, given, *rest)
+
+    monkeypatch.setattr(VoteLearner, "_lift", starved)
+    other = View.from_arrays(view.camera, np.roll(view.read_labels(), 9, axis=1))
+    nearer = replace(view.camera, K=view.camera.K * [[1.1], [1.1], [1]])
+    for change in (lambda: learner.relabel(other), lambda: learner.move(view.name, nearer)):
+        with pytest.raises(MemoryError):
+            change()
+        np.testing.assert_array_equal(learner._votes.dense(), before)
+        assert learner.views[view.name] is view
 
 
 @pytest.mark.parametrize("weight", [0.0, 3.0])
