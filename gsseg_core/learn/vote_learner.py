@@ -9,6 +9,7 @@ import numpy as np
 from gsseg_core.data.view import View
 from gsseg_core.learn.learner import Learner, Progress, silent
 from gsseg_core.learn.usable_views import read_mask
+from gsseg_core.raster.view_operator import ViewOperator
 from gsseg_core.scene.camera import Camera
 
 
@@ -33,32 +34,32 @@ class VoteLearner(Learner):
         A view that sees nothing of the scene from there stays, without votes. On any error, nothing has changed.
         """
         before = self._observed(name)
-        after, seen = replace(before, camera=camera), read_mask(before, self.num_classes)
-        self._lift(after, seen, 1)
-        try:
-            self._lift(before, seen, -1)
-        except BaseException:  # Too little memory.
-            self._lift(after, seen, -1)
-            raise
-        self.views[name] = after
-        self._prepared.drop(name)
+        self._exchange(before, replace(before, camera=camera))
 
     def relabel(self, view: View) -> None:
         """Have a view show other labels, seen from where it is: its operator is made once for both.
 
         On any error, nothing has changed.
         """
-        before, view = self._observed(view.name), view.held()
-        after, earlier = (read_mask(each, self.num_classes) for each in (view, before))
-        operator = self._operator_of(view)
-        self._lift(view, after, 1, operator)
+        before, after = self._observed(view.name), view.held()
+        self._exchange(before, after, self._operator_of(after))
+
+    def keep_last(self, count: int) -> None:
+        """Drop the oldest views and their masks, all but so many, of at least one; their votes stay."""
+        for name in list(self.views)[:-count]:
+            self.forget(name)
+
+    def _exchange(self, before: View, after: View, operator: ViewOperator | None = None) -> None:
+        """Put a view in the place of one of its name, seen by the same operator if one is given."""
+        new, old = (read_mask(view, self.num_classes) for view in (after, before))
+        self._lift(after, new, 1, operator)
         try:
-            self._lift(before, earlier, -1, operator)
+            self._lift(before, old, -1, operator)
         except BaseException:  # Too little memory.
-            self._lift(view, after, -1, operator)
+            self._lift(after, new, -1, operator)
             raise
-        self.views[view.name] = view
-        self._prepared.drop(view.name)
+        self.views[after.name] = after
+        self._prepared.drop(after.name)
 
     def predict_without(self, view: View) -> np.ndarray:
         """Blend into a view the votes of all others as probabilities, (H, W, K) float32; exact, by subtraction."""

@@ -331,8 +331,7 @@ class LiveSession:
         votes = self._no_votes(state.num_classes)
         votes.adopt(state)  # To cast votes of old anew takes long.
         votes.resize(max(state.num_classes, self._classes.least))  # Out of memory here, nothing is forgotten.
-        for name in list(votes.views)[: -self.max_views]:
-            votes.forget(name)
+        votes.keep_last(self.max_views)
         with self._lock:
             self._forget(state.class_names, votes, state.num_fused)
             self._learnt = state.learnt
@@ -396,5 +395,4 @@ class LiveSession:
             self._live.resize(view.largest_label + 1)
 
     def _drop_old_views(self) -> None:
-        while len(self._live.views) > self.max_views:
-            self._live.forget(next(iter(self._live.views)))
+        self._live.keep_last(self.max_views)
