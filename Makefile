@@ -31,8 +31,6 @@ export CMAKE_BUILD_PARALLEL_LEVEL ?= $(shell nproc 2>/dev/null || echo 1)
 
 # Beside each other, threads of NumPy's matrix products that wait would take the cores from others, so there is one.
 run-tests run-fast-tests: export OPENBLAS_NUM_THREADS = 1
-# One thread for each worker's kernels takes a tenth less of the processor; `make test` runs with all threads.
-run-fast-tests: export NUMBA_NUM_THREADS = 1
 
 # Targets that `make test` makes beside the tests.
 BESIDE ?=
