@@ -60,6 +60,7 @@ setup(
         "dev": [
             "distributed>=2024.8",
             "gaussforge>=0.6",
+            "greenlet>=3.0",
             "gsply>=0.4.6",
             "hypothesis>=6.100",
             "import-linter>=2.5",

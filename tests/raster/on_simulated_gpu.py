@@ -14,6 +14,7 @@ import numpy as np
 import pytest
 import torch
 from operator_cases import dense, make_camera, make_scene, random_mask, random_view
+from simulated_blocks import take_turns
 
 from gsseg_core.csr_rows import CSRRows
 from gsseg_core.data.label_evidence import LabelEvidence
@@ -31,6 +32,8 @@ from gsseg_core.raster.view_operator import ViewOperator
 from gsseg_core.raster.view_renderer import PixelGrid
 from gsseg_core.raster.vote_total import VoteTotal
 from gsseg_core.scene.gaussian_scene import GaussianScene
+
+take_turns()
 
 WIDTH, HEIGHT, CLASSES = 19, 13, 6  # two tiles, one of them cut off
 SCENE, CAMERA = random_view(4, 80, WIDTH, HEIGHT)
