@@ -178,7 +178,7 @@ class Segmentation:
         return replace(self, shares=tempered_rows(self.shares, change), temperature=temperature)
 
     def at(self, granularity: float | None) -> Segmentation:
-        """Cut the tree: the segmentation whose classes are its nodes at a granularity; by default, the objects.
+        """Cut the tree: the segmentation whose classes are its nodes at a granularity; where that is None, the objects.
 
         What is an object there keeps its id and name. What a Gaussian has of its own object goes to its own part, what
         it has of another to the largest part of that.

@@ -79,7 +79,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     what = "a scene, to print its format; or a dataset, to read it, and with --scene to see whether its cameras fit"
     parser.add_argument("path", nargs="?", metavar="PATH", help=what)
     parser.add_argument("--scene", metavar="SCENE", help="trained scene that cameras of the dataset PATH should fit")
-    labels = "the dataset's folder of masks, which are looked at where there are no photos (default: labels)"
+    labels = "the dataset's folder of masks; with --scene, they count where there are no photos (default: labels)"
     parser.add_argument("--labels", default="labels", metavar="DIR", help=labels)
     add_dataparser(parser)
     add_device(parser)

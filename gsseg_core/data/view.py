@@ -194,7 +194,7 @@ class View:
 
     @property
     def name(self) -> str:
-        """Stem of the image's file name."""
+        """Name of the camera, which is that of the image as a rule; see `Camera.name`."""
         return self.camera.name
 
     @property
@@ -249,7 +249,7 @@ class View:
         MaskFormatError
             The mask is missing or broken.
         MaskSizeError
-            The mask has another size than the camera.
+            The mask has another shape than the camera's image; or another size, if it is soft: those are not scaled.
         UnknownLabelError
             A label is not among the classes.
         """

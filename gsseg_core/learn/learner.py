@@ -60,9 +60,9 @@ class Learner(ABC):
     device : str
         Where views are rendered.
     memory_budget : int, optional
-        Bytes of prepared views to keep in memory between steps, an eighth of what is free by default. Those beyond it
-        are kept in a temporary file, or prepared anew each time where that has no space; with 0, always. What is learnt
-        does not depend on it.
+        Bytes of prepared views to keep between steps; by default an eighth of the free memory, or half of a GPU's.
+        Those beyond it are kept in a temporary file, or prepared anew each time where that has no space, on a GPU, and
+        with 0. What is learnt does not depend on it.
 
     Attributes
     ----------
@@ -72,13 +72,13 @@ class Learner(ABC):
         Names of views that could not be used, and why.
     code_rows_ : CSRRows
         After `fit`: class probabilities of each Gaussian, the paper's object codes, float32; a row without entries
-        where no labelled pixel saw it, or all that is known is what it is not, see docs/masks.md.
+        where no pixel of a label that was used saw it, or all that is known is what it is not, see docs/masks.md.
     codes_ : (N, K) float32
         The same with its zeros, written out each time that it is asked for.
     observed_ : (N,) bool
         After `fit`: whether the Gaussian has a code.
     history_ : list of float
-        The objective after each step of `fit`, for learners that have one.
+        The objective of `fit`, step by step, for learners that have one.
     converged_ : bool
         After `fit`: whether another step would have changed little.
     leaves_out : bool

@@ -49,13 +49,13 @@ class RefineSettings:
 
     def __post_init__(self) -> None:
         """Validate."""
-        if self.k != int(self.k) or not 1 <= self.k <= MAX_K:
+        if not 1 <= self.k <= MAX_K or self.k != int(self.k):
             raise SettingsError(f"refinement: found k = {self.k}; expected a whole number from 1 to {MAX_K}")
         if not 0 <= self.beta <= 1:
             raise SettingsError(f"refinement: found beta = {self.beta}; expected a probability from 0 to 1")
         if not 0 <= self.filter_sigmas < float("inf"):
             raise SettingsError(f"refinement: found filter_sigmas = {self.filter_sigmas}; expected 0 or more, finite")
-        if self.carve_views != int(self.carve_views) or self.carve_views < 1:
+        if not 1 <= self.carve_views < float("inf") or self.carve_views != int(self.carve_views):
             raise SettingsError(f"refinement: found carve_views = {self.carve_views}; expected a whole number above 0")
         if self.carve and self.filter:
             raise SettingsError("refinement: found both carve and filter; expected one of them")

@@ -26,7 +26,7 @@ class Camera:
     Attributes
     ----------
     name : str
-        Stem of the image's file name; of a view of a panorama, `_front`, `_right` and so on follow.
+        Stem of the image's file name, after its folders' where two share one; of a panorama, `_front` and so on follow.
     width, height : int
         Image size in pixels.
     K : ndarray (3, 3) float64
@@ -124,7 +124,7 @@ class Camera:
         if (width, height) != expected:
             raise MaskSizeError(
                 f"{source}: mask is {width} x {height} pixels; expected {expected[0]} x {expected[1]}, the size "
-                f"of {self._who} (masks are never resized)"
+                f"of {self._who} (masks like this one are never resized)"
             )
 
     @property

@@ -72,7 +72,8 @@ class SceneDelta:
     Raises
     ------
     SceneDeltaError
-        Ids or groups are negative, doubled, or not as many as Gaussians are added, or a motion is no similarity.
+        Ids or groups are no int64, negative, doubled, or not as many as Gaussians are added, or a motion is no
+        similarity.
     """
 
     revision: int | None = None
@@ -93,7 +94,8 @@ class SceneDelta:
             numbers = getattr(self, name)
             if numbers.dtype != np.int64 or numbers.ndim != 1 or numbers.min(initial=0) < 0:
                 raise SceneDeltaError(
-                    f"scene delta: {name} hold {clipped(numbers.tolist())}; expected whole numbers from 0"
+                    f"scene delta: {name} hold {clipped(numbers.tolist())}, {numbers.dtype} {numbers.shape}; expected "
+                    "whole numbers from 0, int64 (M,)"
                 )
             ordered = np.sort(numbers)
             if name != "added_groups" and len(doubled := ordered[1:][ordered[1:] == ordered[:-1]]):

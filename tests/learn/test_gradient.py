@@ -80,8 +80,10 @@ def test_the_documentation_names_the_equations_and_where_the_paper_is_silent() -
 
 
 @pytest.mark.parametrize(
-    "wrong", [{"epochs": 0}, {"rate": 0.0}, {"final_rate": 0.0}, {"final_rate": 1.0}, {"rate": np.inf}]
-)
+    "wrong",
+    [{"epochs": 0}, {"epochs": 1.5}, {"epochs": np.nan}, {"seed": -1}, {"seed": 0.5}, {"rate": 0.0},
+     {"final_rate": 0.0}, {"final_rate": 1.0}, {"rate": np.inf}],
+)  # fmt: skip
 def test_settings_out_of_range_are_refused_by_name(wrong: dict[str, float]) -> None:
     with pytest.raises(SettingsError, match=f"gradient: .*{next(iter(wrong))}.*expected"):
         GradientSettings(**wrong)  # type: ignore[arg-type]

@@ -5,6 +5,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import gc
 import weakref
 from collections.abc import Callable
@@ -18,9 +19,11 @@ from simulated_blocks import take_turns
 
 from gsseg_core.csr_rows import CSRRows
 from gsseg_core.data.label_evidence import LabelEvidence
+from gsseg_core.data.view import View
 from gsseg_core.errors import GssegError, SceneValueError
 from gsseg_core.learn.em import em_cpu_kernels, em_gpu_kernels
 from gsseg_core.learn.learner import UNITS
+from gsseg_core.live.living_session import LivingSession
 from gsseg_core.raster.backends import make_operator, vote_total
 from gsseg_core.raster.cpu import tiling
 from gsseg_core.raster.depth import depths
@@ -32,6 +35,7 @@ from gsseg_core.raster.view_operator import ViewOperator
 from gsseg_core.raster.view_renderer import PixelGrid
 from gsseg_core.raster.vote_total import VoteTotal
 from gsseg_core.scene.gaussian_scene import GaussianScene
+from gsseg_core.scene.scene_delta import SceneDelta
 
 take_turns()
 
@@ -161,6 +165,23 @@ def test_votes_of_many_views_are_summed_where_they_lie_and_end_on_the_cpu(
         for mask, means in views:
             gpu.observe(mask, means).vote(total, UNITS, -1)
     assert (theirs.dense() == 7).all()
+
+
+def test_votes_of_a_scene_that_changes_are_those_of_its_views_fused_into_the_last_one() -> None:
+    turned = dataclasses.replace(CAMERA, world_to_camera=np.diag([-1.0, 1, -1, 1]) @ CAMERA.world_to_camera)
+    session = LivingSession(SCENE, device="cuda")
+    # The last one comes in the place of the first.
+    for seed, (name, camera) in enumerate([("a", CAMERA), ("b", turned), ("c", turned), ("a", CAMERA)]):
+        mask = random_mask(seed, WIDTH, HEIGHT, range(CLASSES))
+        assert session.fuse(View.from_arrays(dataclasses.replace(camera, name=name), mask)) is None
+    seen, seen_too = (make_operator(SCENE, camera).ids for camera in (CAMERA, turned))
+    assert session.update(SceneDelta(removed=np.setdiff1d(seen, seen_too)[::3].astype(np.int64))).num_views_lifted == 1
+    fresh = LivingSession(session.living, device="cuda")
+    for view in session.views:
+        fresh.fuse(view)
+    ours, theirs = (one._live._votes.dense() for one in (fresh, session))
+    assert ours.any()
+    np.testing.assert_array_equal(theirs, ours)
 
 
 def test_objects_alone_have_the_reasons_of_the_cpu() -> None:

@@ -6,6 +6,7 @@ import ast
 import importlib.util
 import json
 import os
+import re
 import runpy
 import stat
 import subprocess
@@ -177,6 +178,16 @@ def test_parameters_file_has_every_parameter_at_its_default() -> None:
     assert in_file == declared
     # 1 and 1.0 are equal to Python but not to ROS.
     assert {name: type(value) for name, value in in_file.items()} == {n: type(v) for n, v in declared.items()}
+
+
+def test_parameters_file_says_which_parameters_can_be_set_when() -> None:
+    from gsseg_ros.node.declarations import AT_ONCE, DECLARATIONS
+
+    text = (ROOT / "config" / "segment_node.yaml").read_text().split("/**:")[0].replace("\n#", "")
+    at_any_time, others = text.split("segment_node.yaml", 1)[1].split(" can be set at any time, ")
+    assert set(re.findall(r"\w+", at_any_time)) - {"and"} == {name.partition(".")[0] for name in AT_ONCE}
+    at_start = {declaration.name for declaration in DECLARATIONS if declaration.at_start}
+    assert set(re.findall(r"\w+", others.split(" here only")[0])) - {"and"} == at_start
 
 
 @pytest.mark.parametrize(("name", "namespace"), [("gsseg", ""), ("front", "/robot")])

@@ -91,6 +91,14 @@ def test_a_file_that_holds_no_change_is_refused_and_named(
     assert str(raised.value).startswith(str(saved)) and message in str(raised.value)
 
 
+@pytest.mark.parametrize("ids", [np.array([5], np.int32), np.array([[5]])])
+def test_ids_of_another_type_or_shape_are_refused_with_what_was_found(ids: np.ndarray) -> None:
+    with pytest.raises(SceneDeltaError) as raised:
+        SceneDelta(removed=ids)
+    found = f"removed hold {ids.tolist()}, {ids.dtype} {ids.shape}"
+    assert str(raised.value) == f"scene delta: {found}; expected whole numbers from 0, int64 (M,)"
+
+
 def test_an_array_that_claims_to_be_huge_is_refused_before_it_is_inflated(tmp_path: Path) -> None:
     with zipfile.ZipFile(tmp_path / "huge.npz", "w") as archive:
         with archive.open("removed.npy", "w") as member:
