@@ -6,8 +6,9 @@ A key is an id or the name of a class that the masks have (a name stands for all
 that no other key names; without it, those stay as they are. A value is the new name: classes that are given the same
 one, or the one of a class that stays, are merged. null, or "ignore", makes pixels unknown.
 
-A class of several keeps the smallest of their ids. 0 is the background and stays free for it: where an object has it,
-`{"0": "floor"}`, that gets the next id after the largest; `{"background": null}` makes the rest unknown.
+Classes merged into one that stays get its id, others the smallest of theirs. 0 is the background and stays free for it:
+where an object has it, `{"0": "floor"}`, that gets the next id after the largest; `{"background": null}` makes the rest
+unknown.
 """
 
 from __future__ import annotations

@@ -1,7 +1,7 @@
 """Distances from points to their k nearest others, found once and only where asked for, and means over those.
 
 What is kept is not who the neighbours are but how far the k-th one is: with it, all of them are found again in one
-search, and a million points take 16 MB instead of 200. Background that is sure of itself is never asked for, and it is
+search, and a million points take 12 MB instead of 200. Background that is sure of itself is never asked for, and it is
 more than half of most scenes.
 
 Results are bit-identical whatever the order of the points and the number of threads: points tied for the last place

@@ -28,6 +28,7 @@ CLASSES = {0: "background", 1: "chair", 2: "stool", 5: "person", 9: "chair"}
         ({"stool": "seat"}, {0: 0, 1: 1, 2: 2, 5: 5, 9: 9}, {**CLASSES, 2: "seat"}),
         ({"chair": "seat", "stool": "seat"}, {0: 0, 1: 1, 2: 1, 5: 5, 9: 1}, {0: "background", 1: "seat", 5: "person"}),
         ({"5": "stool"}, {0: 0, 1: 1, 2: 2, 5: 2, 9: 9}, {0: "background", 1: "chair", 2: "stool", 9: "chair"}),
+        ({"1": "person", "2": "person"}, {0: 0, 1: 5, 2: 5, 5: 5, 9: 9}, {0: "background", 5: "person", 9: "chair"}),
         ({"person": None}, {0: 0, 1: 1, 2: 2, 5: -1, 9: 9}, {0: "background", 1: "chair", 2: "stool", 9: "chair"}),
         (
             {"9": None, "chair": "a"},
