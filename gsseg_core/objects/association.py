@@ -90,9 +90,9 @@ class AssociationSettings:
                 "in [0, 1], the second the larger one"
             )
         for name in ("doubt", "evidence", "full_sight_px", "unseen", "rounds"):
-            if getattr(self, name) < 0:
-                raise SettingsError(f"association: {name} is {getattr(self, name)}; expected 0 or more")
-        if min(self.full_sight, self.plenty) <= 0:
+            if not 0 <= getattr(self, name) < np.inf:
+                raise SettingsError(f"association: {name} is {getattr(self, name)}; expected 0 or more, finite")
+        if not (self.full_sight > 0 and self.plenty > 0):
             raise SettingsError(
                 f"association: full_sight is {self.full_sight}, plenty {self.plenty}; expected more than 0"
             )

@@ -47,8 +47,8 @@ class GraphSettings:
 
     def __post_init__(self) -> None:
         """Validate."""
-        if self.k < 1 or self.steps < 0:
-            raise SettingsError(f"graph: k is {self.k}, steps {self.steps}; expected at least 1 and 0")
+        if not all(isinstance(n, int | np.integer) for n in (self.k, self.steps)) or self.k < 1 or self.steps < 0:
+            raise SettingsError(f"graph: k is {self.k}, steps {self.steps}; expected whole numbers, at least 1 and 0")
         if not 0 <= self.strength < float("inf"):
             raise SettingsError(f"graph: strength is {self.strength} px; expected 0 or more, finite")
 

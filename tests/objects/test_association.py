@@ -329,7 +329,8 @@ def test_views_of_a_corner_of_something_large_say_that_what_is_beside_it_is_anot
 
 def test_settings_that_make_no_sense_are_refused() -> None:
     senseless = {"kept": 0.0}, {"agreement": 1.0}, {"doubt": -1.0}, {"full_sight": 0.0}, {"least_share": 0.9}
-    for wrong in (*senseless, {"plenty": 0.0}):
+    no_numbers = ({name: np.nan} for name in ("doubt", "rounds", "full_sight", "plenty"))
+    for wrong in (*senseless, {"plenty": 0.0}, *no_numbers):
         with pytest.raises(SettingsError, match="association"):
             AssociationSettings(**wrong)
 

@@ -162,7 +162,9 @@ def test_wrong_settings_and_shapes_are_refused() -> None:
     codes, evidence = some_codes()
     with pytest.raises(SceneValueError, match=r"expected \(80, K\) and \(80,\)"):
         propagate(graph, codes[1:], evidence)
-    for wrong in ({"k": 0}, {"steps": -1}, {"strength": -1.0}, {"strength": float("nan")}):
+    nan, infinite = float("nan"), float("inf")
+    counts = ({"k": 0}, {"k": nan}, {"k": infinite}, {"k": 1.5}, {"steps": -1}, {"steps": nan}, {"steps": 0.5})
+    for wrong in (*counts, {"strength": -1.0}, {"strength": nan}, {"strength": infinite}):
         with pytest.raises(SettingsError, match="graph: "):
             GraphSettings(**wrong)
 
