@@ -1,4 +1,4 @@
-"""Programs keep freed memory for the next view, so that it need not be got from the system again."""
+"""Programs keep freed memory for the next view, and at their end look through none of it."""
 
 from __future__ import annotations
 
@@ -67,3 +67,24 @@ def test_what_one_thread_has_freed_another_uses_again() -> None:
         pytest.skip("the C library is not glibc")
     done = subprocess.run([sys.executable, "-c", IN_THREADS], capture_output=True, text=True, check=True)
     assert float(done.stdout) < 160  # MiB; what each of ten threads takes is 38
+
+
+AT_THE_END = """
+import atexit
+from gsseg_core.freed_memory import end_without_a_search
+
+class Circle:
+    def __init__(self):
+        self.itself = self
+    def __del__(self):
+        print("searched")
+
+atexit.register(print, "ended")
+Circle()
+"""
+
+
+@pytest.mark.parametrize(("call", "said"), [("", "ended\nsearched\n"), ("end_without_a_search()", "ended\n")])
+def test_a_program_that_says_so_ends_without_a_search_for_circles_of_objects(call: str, said: str) -> None:
+    done = subprocess.run([sys.executable, "-c", AT_THE_END + call], capture_output=True, text=True, check=True)
+    assert done.stdout == said

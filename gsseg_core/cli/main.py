@@ -55,13 +55,14 @@ def _run(arguments: Sequence[str] | None) -> int:
     given = sys.argv[1:] if arguments is None else arguments
     options = build_parser(given).parse_args(given)
 
-    from gsseg_core.freed_memory import keep_freed_memory
+    from gsseg_core.freed_memory import end_without_a_search, keep_freed_memory
 
     _refuse_empty(options)
     _check_threads()
     keep_freed_memory()
     try:
         if arguments is None:
+            end_without_a_search()
             interrupts.raise_once()
         code: int = options.run(options)
         return code

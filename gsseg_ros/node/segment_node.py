@@ -20,7 +20,7 @@ from rclpy.lifecycle import LifecycleNode, LifecycleState, TransitionCallbackRet
 from rclpy.parameter import Parameter
 from rclpy.signals import SignalHandlerOptions
 
-from gsseg_core.freed_memory import keep_freed_memory
+from gsseg_core.freed_memory import end_without_a_search, keep_freed_memory
 from gsseg_core.live.living_session import LivingSession
 from gsseg_core.warm_up import warm_up
 from gsseg_ros.node import declarations, diagnostics, parameters
@@ -314,6 +314,7 @@ def _end(executor: NodeExecutor, node: SegmentNode) -> None:
 def main(args: list[str] | None = None) -> int:
     """Run the node until SIGINT or SIGTERM; returns the exit code: 0, or 2 for arguments that cannot be used."""
     keep_freed_memory()
+    end_without_a_search()
     make_room()
     # rclpy's own handlers would take the context away under a running job, and its spin() does not always notice.
     stop = threading.Event()
