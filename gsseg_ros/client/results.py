@@ -171,7 +171,8 @@ class LearnResult(Timed):
     converged : bool
         Whether it stopped because it had converged.
     loss : float
-        Mean negative log-likelihood of the masks at the end, nats per pixel; NaN where the learner has none.
+        What the learner minimised, as of its last step, in nats per labelled pixel: em the negative log posterior,
+        gradient the cross-entropy; NaN where there is no such thing.
     """
 
     report: SegmentationReport
