@@ -106,7 +106,7 @@ def test_the_views_of_killed_workers_are_done_again_elsewhere(
         Path(marks, str(os.getpid())).touch()
         time.sleep(3600)
 
-    lull = changed(client, victims, "gsseg_core.learn.em.em_cpu_kernels", "pair_likelihood", mix)
+    lull = changed(client, victims, "gsseg_core.learn.em.em_kernels", "pair_likelihood", mix)
     steps: list[int] = []
     others = ExitStack()
 

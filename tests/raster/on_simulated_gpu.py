@@ -21,7 +21,7 @@ from gsseg_core.csr_rows import CSRRows
 from gsseg_core.data.label_evidence import LabelEvidence
 from gsseg_core.data.view import View
 from gsseg_core.errors import GssegError, SceneValueError
-from gsseg_core.learn.em import em_cpu_kernels, em_gpu_kernels
+from gsseg_core.learn.em import em_gpu_kernels, em_kernels
 from gsseg_core.learn.learner import UNITS
 from gsseg_core.live.living_session import LivingSession
 from gsseg_core.raster.backends import make_operator, vote_total
@@ -279,7 +279,7 @@ def test_edges_of_the_scene_are_those_of_the_cpu(grey: bool) -> None:
     scene = GaussianScene.from_arrays(SCENE.means, SCENE.quats, SCENE.scales, SCENE.opacities, colors)
     ours, theirs = (
         kernels.edges_along(make_operator(scene, CAMERA, device), scene, MASK, max(HEIGHT, WIDTH))
-        for kernels, device in ((em_cpu_kernels, "cpu"), (em_gpu_kernels, "cuda"))
+        for kernels, device in ((em_kernels, "cpu"), (em_gpu_kernels, "cuda"))
     )
     assert ours.any() != grey
     np.testing.assert_allclose(theirs, ours, atol=1e-4)
@@ -300,7 +300,7 @@ def step() -> dict[str, dict[str, np.ndarray]]:
     by_class = np.ascontiguousarray(weights.T)
     votes = CSRRows.from_dense(rng.integers(0, int(100 * UNITS), (len(SCENE), CLASSES)))
     found = {}
-    for name, kernels, operator in zip(("ours", "theirs"), (em_cpu_kernels, em_gpu_kernels), operators(), strict=True):
+    for name, kernels, operator in zip(("ours", "theirs"), (em_kernels, em_gpu_kernels), operators(), strict=True):
         seen = operator.observe(MASK)
         evidence = LabelEvidence(np.arange(len(seen.classes), dtype=np.int32))
         # No view votes for more than all of them.

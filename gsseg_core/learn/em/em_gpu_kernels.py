@@ -1,4 +1,4 @@
-"""What `em_kernels` and `leave_one_out` do with the (Gaussian, label) pairs of a view, on a GPU.
+"""What `em_kernels` does with the (Gaussian, label) pairs of a view, on a GPU.
 
 There is one thread to each Gaussian that the view sees. Sums over Gaussians are of whole units, so that they do not
 depend on the order in which threads come to add.

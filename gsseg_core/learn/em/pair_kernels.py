@@ -14,8 +14,8 @@ from gsseg_core.raster.observation import Observation
 
 
 def kernels_on(device: str) -> ModuleType:
-    """Return the module whose functions work on a device: `em_cpu_kernels`, or its like for a GPU."""
-    return importlib.import_module(f"gsseg_core.learn.em.{'em_cpu_kernels' if device == 'cpu' else 'em_gpu_kernels'}")
+    """Return the module whose functions work on a device: `em_kernels`, or its like for a GPU."""
+    return importlib.import_module(f"gsseg_core.learn.em.{'em_kernels' if device == 'cpu' else 'em_gpu_kernels'}")
 
 
 def rows_on(rows: CSRRows, device: str) -> tuple[Any, ModuleType]:
