@@ -340,14 +340,14 @@ class Learner(ABC):
         return True
 
     def _of_each(
-        self, work: Callable[[str, Observation], R], names: Iterable[str] | None, tick: Callable[[], None]
+        self, work: Callable[[str, Observation], R], names: Iterable[str], tick: Callable[[], None]
     ) -> Iterator[tuple[str, R]]:
-        """Give the name of each prepared view, or of some, and what `work` makes of it; `tick` is called before each.
+        """Give the names of some prepared views, and what `work` makes of each; `tick` is called before each.
 
         Several views are worked on at once. Every second time the last view comes first: of a file that is larger than
         the memory that caches it, what was read last is still there.
         """
-        names, self._turned = list(self.views if names is None else names), not self._turned
+        names, self._turned = list(names), not self._turned
         names = names if self._turned else names[::-1]
 
         def ask(name: str) -> R:

@@ -96,7 +96,7 @@ def test_what_is_rejected_has_no_say_against_others() -> None:
         views.append(View.from_arrays(view.camera, np.where(near, UNKNOWN, view.read_labels())))
     learner = taught(EMLearner(SCENE, NUM_CLASSES + 1), views)
     votes, evidence = learner._votes.rows(), learner.observation(right.name).evidence
-    _, at_first = learner._find_rejected(votes, lambda: None, dict.fromkeys(learner.views))
+    _, at_first = learner._find_rejected(votes, dict.fromkeys(learner.views), lambda: None)
     assert evidence.named()[at_first[right.name]].tolist() == [1]
     _, rejected = learner._reject_regions(votes, lambda: None)
     assert rejected.keys() == {wrong.name}

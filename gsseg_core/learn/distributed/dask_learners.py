@@ -13,6 +13,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from concurrent.futures import CancelledError
+from functools import partial
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
@@ -22,9 +23,7 @@ from gsseg_core.data.view import View
 from gsseg_core.errors import GssegError, SchedulerError
 from gsseg_core.learn.distributed import dask_worker
 from gsseg_core.learn.distributed.dask_cluster import PATIENCE, UNREACHABLE, check_workers, find_workers, name_of
-from gsseg_core.learn.distributed.dask_worker import Part
-from gsseg_core.learn.em.confusion_model import ErrorModel
-from gsseg_core.learn.em.em_learner import EMLearner
+from gsseg_core.learn.em.em_learner import EMLearner, OverViews, Tick
 from gsseg_core.learn.learner import Learner, Progress, silent
 from gsseg_core.learn.usable_views import UnusableViewError
 from gsseg_core.learn.vote_learner import VoteLearner
@@ -79,9 +78,9 @@ class _OnWorkers(Learner):
         progress("observe", len(named), len(named))
 
     def _sum(
-        self, task: Callable[..., Part], views: Mapping[str, View], report: Report,
+        self, task: Callable[..., OverViews], views: Mapping[str, View], report: Report,
         by_view: Mapping[str, Any] | None = None, *values: Any,
-    ) -> Part:  # fmt: skip
+    ) -> OverViews:  # fmt: skip
         """Sum up what a task makes of these views.
 
         Raises
@@ -104,9 +103,9 @@ class _OnWorkers(Learner):
         raise SchedulerError(f"{name_of(self._client)}: lost results {ATTEMPTS} times; expected workers that stay")
 
     def _try_to_sum(
-        self, used: list[Future], task: Callable[..., Part], views: Mapping[str, View], report: Report,
+        self, used: list[Future], task: Callable[..., OverViews], views: Mapping[str, View], report: Report,
         by_view: Mapping[str, Any], values: Sequence[Any],
-    ) -> Part:  # fmt: skip
+    ) -> OverViews:  # fmt: skip
         shares = self._deal(views, report)
         copies = [self._send(value, [share.worker for share in shares]) for value in values]
         used += [future for copy in copies for future in copy.values()]
@@ -126,7 +125,7 @@ class _OnWorkers(Learner):
         self._wait(used, lambda: report(sum(sizes[part.key] for part in parts if part.done())))
         for future in used:
             self._check(future)
-        total: Part = self._client.gather(sums[0], direct=self._direct)
+        total: OverViews = self._client.gather(sums[0], direct=self._direct)
         return total
 
     def _deal(self, views: Mapping[str, View], report: Report) -> list[_Share]:
@@ -225,34 +224,8 @@ class DistributedEM(_OnWorkers, EMLearner):
 
     checks_masks = False  # which would prepare all views here
 
-    def _find_rejected(
-        self, votes: CSRRows, tick: Callable[[], None], doubted: Mapping[str, np.ndarray | None]
-    ) -> tuple[np.ndarray, dict[str, np.ndarray]]:
-        views = {name: self.views[name] for name in doubted}
-        if not views:
-            return np.zeros(len(votes.data), np.int64), {}
-        return self._sum(dask_worker.find_rejected, views, lambda done: tick(), doubted, votes)
-
-    def _initial_error_models(
-        self, votes: CSRRows, rejected: Mapping[str, np.ndarray], tick: Callable[[], None],
-        names: Iterable[str] | None = None,
-    ) -> dict[str, ErrorModel]:  # fmt: skip
-        models = self._step(dask_worker.initial_error_models, tick, rejected, votes)[1]
-        return {name: models[name] for name in self.views}
-
-    def _e_step(
-        self, codes: CSRRows, models: dict[str, ErrorModel], tick: Callable[[], None]
-    ) -> tuple[np.ndarray, dict[str, float]]:
-        return self._step(dask_worker.e_step, tick, models, codes)
-
-    def _refit_error_models(
-        self, codes: CSRRows, gradient: np.ndarray, prior: np.ndarray, models: dict[str, ErrorModel],
-        tick: Callable[[], None],
-    ) -> dict[str, ErrorModel]:  # fmt: skip
-        models.update(self._step(dask_worker.refit_error_models, tick, models, codes, gradient, prior)[1])
-        return models
-
-    def _step(
-        self, task: Callable[..., Part], tick: Callable[[], None], by_view: Mapping[str, Any] | None, *values: Any
-    ) -> Part:
-        return self._sum(task, self.views, lambda done: tick(), by_view, *values)
+    def _over_views(
+        self, work: Callable[..., OverViews], by_view: Mapping[str, Any], tick: Tick, *arrays: CSRRows | np.ndarray
+    ) -> OverViews:
+        views = {name: self.views[name] for name in by_view}
+        return self._sum(partial(dask_worker.go_over, work), views, lambda done: tick(), by_view, *arrays)

@@ -6,9 +6,8 @@ A task leaves its inputs as they are, so that it can be run again.
 from __future__ import annotations
 
 import threading
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
-from copy import deepcopy
 from dataclasses import replace
 from typing import Any
 
@@ -19,17 +18,13 @@ from numpy.lib.recfunctions import repack_fields
 from gsseg_core.csr_rows import CSRRows
 from gsseg_core.data.view import View
 from gsseg_core.errors import GssegError
-from gsseg_core.learn.em.confusion_model import ErrorModel
-from gsseg_core.learn.em.em_learner import EMLearner, EMSettings
+from gsseg_core.learn.em.em_learner import EMLearner, EMSettings, OverViews
 from gsseg_core.learn.learner import UNITS
 from gsseg_core.learn.usable_views import UnusableViewError
 from gsseg_core.raster.vote_total import VoteTotal
 from gsseg_core.scene.gaussian_scene import GaussianScene
 from gsseg_core.scene.vertices import DC
 from gsseg_core.spatial.row_order import along_curve
-
-Part = tuple[Any, dict[str, Any]]
-"""A sum over some views, of int64, perhaps sparse, or None; and by view what else came out."""
 
 ONLY_VOTES = EMSettings(errors=False)  # what is wrong with a mask does not matter to votes
 
@@ -86,7 +81,7 @@ def prepare(
     return shard
 
 
-def sum_votes(shard: Shard, wanted: dict[str, Any]) -> Part:
+def sum_votes(shard: Shard, wanted: dict[str, Any]) -> OverViews:
     """Count votes; beside them, why a view was rejected, or ""."""
     votes = VoteTotal(len(shard.scene), shard.num_classes, along_curve(shard.scene))
     with _all_threads():
@@ -96,31 +91,13 @@ def sum_votes(shard: Shard, wanted: dict[str, Any]) -> Part:
     return votes.rows(), {name: shard.rejected.get(name, "") for name in wanted}
 
 
-def find_rejected(shard: Shard, doubted: dict[str, np.ndarray | None], votes: CSRRows) -> Part:
-    """Sum the votes of rejected regions; beside them, which labels of each view these are."""
+def go_over(
+    work: Callable[..., OverViews], shard: Shard, by_view: dict[str, Any], *arrays: CSRRows | np.ndarray
+) -> OverViews:
+    """Have a method of `EMLearner` go over the views of a shard, as `EMLearner._over_views` does over all."""
+    usable = (as_compiled_for(array) if isinstance(array, CSRRows) else array for array in arrays)
     with _all_threads():
-        return shard._find_rejected(as_compiled_for(votes), _go_on, doubted)
-
-
-def initial_error_models(shard: Shard, rejected: dict[str, np.ndarray | None], votes: CSRRows) -> Part:
-    """Estimate the first error model of each view."""
-    known = {name: labels for name, labels in rejected.items() if labels is not None}
-    with _all_threads():
-        return None, shard._initial_error_models(as_compiled_for(votes), known, _go_on, rejected)
-
-
-def e_step(shard: Shard, models: dict[str, ErrorModel], codes: CSRRows) -> Part:
-    """Sum the gradient of the log-likelihood; beside it, each view's log-likelihood."""
-    with _all_threads():
-        return shard._e_step(as_compiled_for(codes), models, _go_on)
-
-
-def refit_error_models(
-    shard: Shard, models: dict[str, ErrorModel], codes: CSRRows, gradient: np.ndarray, prior: np.ndarray  # (Z,), (Z,)
-) -> Part:  # fmt: skip
-    """Re-estimate the views' error models."""
-    with _all_threads():
-        return None, shard._refit_error_models(as_compiled_for(codes), gradient, prior, deepcopy(models), _go_on)
+        return work(shard, *usable, by_view, lambda: None)
 
 
 def hand_on(value: Any) -> Any:
@@ -128,7 +105,7 @@ def hand_on(value: Any) -> Any:
     return value
 
 
-def add(one: Part, two: Part) -> Part:
+def add(one: OverViews, two: OverViews) -> OverViews:
     """Add two sums over different views."""
     if isinstance(one[0], CSRRows):
         total: Any = as_compiled_for(one[0]).plus(as_compiled_for(two[0]))
@@ -151,6 +128,3 @@ def _all_threads() -> Iterator[None]:
 def as_compiled_for(rows: CSRRows) -> CSRRows:
     """Kernels would be compiled once more for arrays that cannot be written to, as those from the network may be."""
     return CSRRows(*(np.require(array, requirements=["C", "W"]) for array in rows))
-
-
-def _go_on() -> None: ...

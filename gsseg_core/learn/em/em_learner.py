@@ -22,9 +22,9 @@ regions whose label the votes of all other views contradict lose it (`rejected_r
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Mapping
 from contextlib import nullcontext
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any
 
@@ -55,6 +55,9 @@ REFIT_FACTOR = 4  # error models are re-estimated once a step gains less than th
 
 Tick = Callable[[], None]
 """Called for each view, so that whoever listens can stop the work at once."""
+
+OverViews = tuple[Any, dict[str, Any]]
+"""What comes of some views: a sum over them, of int64, perhaps sparse, or None; and by view what else came out."""
 
 
 @dataclass(frozen=True)
@@ -182,13 +185,15 @@ class EMLearner(Learner):
         # in every step, so that rows keep their classes, unless the prior is taken anew.
         codes = resolved.with_data(resolved.data.astype(np.float32) * np.float32(VOTE_UNIT) + prior.data).normalised()
         self.history_ = history = list[float]()
-        models = self._initial_error_models(votes, rejected, tick)
+        known = {name: rejected.get(name) for name in self.views}
+        _, estimated = self._over_views(EMLearner._initial_error_models, known, tick, votes)
+        models: dict[str, ErrorModel] = {name: estimated[name] for name in known}
         pixels = sum(model.num_pixels for model in models.values())
         named = sum(model.named_pixels for model in models.values())
         self.rounds_ = rounds = [0]
         while len(history) < settings.max_steps:
             tick = partial(progress, "em", len(history), settings.max_steps)
-            gradient, log_likelihoods = self._e_step(codes, models, tick)
+            gradient, log_likelihoods = self._over_views(EMLearner._e_step, models, tick, codes)
             history.append(self._lower_bound(codes, prior, log_likelihoods) / pixels)
             rounds[-1] += 1
             last_round = len(rounds) > settings.refits or not settings.errors
@@ -200,7 +205,7 @@ class EMLearner(Learner):
                 background = codes.has_column(0)
                 self._last_step_ = before, backend.put(gradient, self.device), background
             elif small:
-                self._refit_error_models(codes, gradient, prior.data, models, tick)
+                models |= self._over_views(EMLearner._refit_error_models, models, tick, codes, gradient, prior.data)[1]
                 rounds.append(0)
                 if any_against:  # Such votes say little of what the neighbours are; the probabilities know by now.
                     codes, gradient, prior = with_prior(codes, gradient, self._spatial_prior(codes, evidence))
@@ -283,32 +288,34 @@ class EMLearner(Learner):
 
         What is rejected must not speak against others: so each is tested once more, by the votes that are left.
         """
-        rejected_votes, doubted = self._find_rejected(votes, tick, dict.fromkeys(self.views))
-        left = votes.with_data(votes.data - rejected_votes)
-        rejected_votes, rejected = self._find_rejected(left, tick, doubted)
+        rejected_votes, rejected = self._over_views(EMLearner._find_rejected, dict.fromkeys(self.views), tick, votes)
+        if rejected:
+            left = votes.with_data(votes.data - rejected_votes)
+            rejected_votes, rejected = self._over_views(EMLearner._find_rejected, rejected, tick, left)
         return votes.with_data(votes.data - rejected_votes).nonzero(), rejected
 
+    def _over_views(
+        self, work: Callable[..., OverViews], by_view: Mapping[str, Any], tick: Tick, *arrays: CSRRows | np.ndarray
+    ) -> OverViews:
+        """Have a method below go over some views; these change nothing, so it may be done elsewhere, and again."""
+        return work(self, *arrays, by_view, tick)
+
     def _find_rejected(
-        self, votes: CSRRows, tick: Tick, doubted: Mapping[str, np.ndarray | None]
+        self, votes: CSRRows, doubted: Mapping[str, np.ndarray | None], tick: Tick
     ) -> tuple[np.ndarray, dict[str, np.ndarray]]:
         """Find the labels of some views that the other views contradict, by the votes of all, int64.
 
         Of a view that is None among the `doubted`, all labels are tested; else those marked, (L,) bool, whose votes are
-        not among the votes.
-
-        Returns
-        -------
-        rejected_votes : (Z,) int64
-            Votes of those that are found, for each entry of the votes.
-        rejected : dict of str to (L,) bool
-            Which they are; views without any are left out.
+        not among the votes. Returns the votes of those that are found, (Z,) int64 for each entry of the votes, and
+        which they are, (L,) bool by view; views without any are left out.
         """
         possible, device = self._possible(), self._device_of(votes)
         votes, backend = rows_on(votes, device)
         remaining, rejected = backend.zeros(votes, np.int64), {}
 
+        least = self.settings.least_agreement
+
         def find(name: str, observation: Observation) -> tuple[np.ndarray, Observation]:
-            least = self.settings.least_agreement
             return find_rejected(votes, observation, possible, least, device, doubted[name]), observation
 
         for name, (labels, observation) in self._of_each(find, doubted, tick):
@@ -323,11 +330,11 @@ class EMLearner(Learner):
         return "cpu" if votes.data.min(initial=0) < 0 else self.device
 
     def _initial_error_models(
-        self, votes: CSRRows, rejected: Mapping[str, np.ndarray], tick: Tick, names: Iterable[str] | None = None
-    ) -> dict[str, ErrorModel]:
-        """Estimate an error model for each view, or for some, from the votes of all other views.
+        self, votes: CSRRows, rejected: Mapping[str, np.ndarray | None], tick: Tick
+    ) -> tuple[None, dict[str, ErrorModel]]:
+        """Estimate an error model for each of some views from the votes of all other views.
 
-        The votes, int64, are without those of labels that are `rejected`: (L,) bool, of views that have any.
+        The votes, int64, are without those of labels that are `rejected`: (L,) bool, None of views without any.
         """
         settings, possible = self.settings, self._possible()
         votes, backend = rows_on(votes, self._device_of(votes))
@@ -336,23 +343,18 @@ class EMLearner(Learner):
             evidence, outliers = observation.evidence, settings.outliers
             if not settings.errors:
                 return ErrorModel.without_errors(evidence, self.num_classes, outliers, observation.areas)
-            if name in rejected:
-                evidence = evidence.without_names(rejected[name])
+            if (labels := rejected[name]) is not None:
+                evidence = evidence.without_names(labels)
             counts = backend.leave_one_out_counts(votes, observation, possible, evidence, settings.majority)
             return ErrorModel.from_counts(evidence, counts, settings.error_prior, outliers, observation.areas)
 
-        models = dict(self._of_each(estimate, names, tick))
-        return {name: models[name] for name in (self.views if names is None else names)}
+        return None, dict(self._of_each(estimate, rejected, tick))
 
     def _e_step(self, codes: CSRRows, models: dict[str, ErrorModel], tick: Tick) -> tuple[np.ndarray, dict[str, float]]:
         """Sum the gradient of the log-likelihood over the views of these models.
 
-        Returns
-        -------
-        gradient : (Z,) int64
-            With respect to each entry of the codes, in units of `GRADIENT_UNIT`.
-        log_likelihoods : dict of str to float
-            Of each view's labels, in nats.
+        Returns it with respect to each entry of the codes, (Z,) int64 in units of `GRADIENT_UNIT`, and the
+        log-likelihood of each view's labels, in nats.
         """
         codes, backend = rows_on(codes, self.device)
 
@@ -368,13 +370,13 @@ class EMLearner(Learner):
         return backend.returned(gradient), log_likelihoods
 
     def _refit_error_models(
-        self, codes: CSRRows, gradient: np.ndarray, prior: np.ndarray, models: dict[str, ErrorModel], tick: Tick
-    ) -> dict[str, ErrorModel]:
-        """Re-estimate each view's error model, in place, from the step without this view; see `codes_without`."""
+        self, codes: CSRRows, gradient: np.ndarray, prior: np.ndarray, models: Mapping[str, ErrorModel], tick: Tick
+    ) -> tuple[None, dict[str, ErrorModel]]:
+        """Re-estimate the error models of some views, each from the step without its view; see `codes_without`."""
         codes, backend = rows_on(codes, self.device)
         gradient, prior = (backend.put(array, self.device) for array in (gradient, prior))
 
-        def refit(name: str, observation: Observation) -> None:
+        def refit(name: str, observation: Observation) -> ErrorModel:
             model, pairs = models[name], backend.pairs_of(observation)
             without = codes_without(observation, model, codes, gradient, prior, self.device)
             likelihood, _ = model.by_label
@@ -384,10 +386,11 @@ class EMLearner(Learner):
             counts[0] += shares.rest
             # Only some pixels of each label were gone through: they count for all of them.
             counts *= observation.areas / np.maximum(observation.weighted_areas, 1)
-            model.m_step(model.expected_counts(counts))
+            refitted = replace(model, confusion=model.confusion.copy())
+            refitted.m_step(model.expected_counts(counts))
+            return refitted
 
-        dict(self._of_each(refit, models, tick))
-        return models
+        return None, dict(self._of_each(refit, models, tick))
 
     def _spatial_prior(self, of: CSRRows, evidence: np.ndarray) -> CSRRows:
         """Prior of all Gaussians, by the votes or the probabilities of their neighbours, and their evidence in px."""
