@@ -64,8 +64,7 @@ def _run(arguments: Sequence[str] | None) -> int:
         if arguments is None:
             end_without_a_search()
             interrupts.raise_once()
-        code: int = options.run(options)
-        return code
+        return options.run(options)
     finally:
         if arguments is None:
             interrupts.leave_at_once()

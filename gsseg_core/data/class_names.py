@@ -38,9 +38,7 @@ def read_classes(path: str | os.PathLike[str], within: Path | None = None) -> di
     for key, name in content.items():
         if not re.fullmatch(r"0|[1-9][0-9]{0,4}", key) or int(key) > MAX_LABEL:
             raise ClassesFileError(f"{path}: id {quoted(key)} is unusable; expected whole numbers from 0 to 65534")
-        if flaw := flaw_of_class_name(name):
-            raise ClassesFileError(f"{path}: id {key} has the name {flaw}")
-        names[int(key)] = name
+        names[int(key)] = check_class_name(name, ClassesFileError, f"{path}: id {key} has")
     return dict(sorted(names.items()))
 
 
@@ -70,8 +68,14 @@ def check_same_names(
 def check_class_names(names: Mapping[int, str], error: type[GssegError]) -> None:
     """Raise `error` unless every name of a class is one line of text."""
     for k, name in names.items():
-        if flaw := flaw_of_class_name(name):
-            raise error(f"class names: id {k} has the name {flaw}")
+        check_class_name(name, error, f"class names: id {k} has")
+
+
+def check_class_name(name: object, error: type[GssegError], who: str) -> str:
+    """Return the name of a class, or raise `error` if it is unusable: what it says begins with `who` has the name."""
+    if flaw := flaw_of_class_name(name):
+        raise error(f"{who} the name {flaw}")
+    return str(name)
 
 
 def flaw_of_class_name(name: object) -> str:

@@ -19,7 +19,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from gsseg_core.data.class_names import BACKGROUND_NAME, flaw_of_class_name, id_of, listed, meant_by
+from gsseg_core.data.class_names import BACKGROUND_NAME, check_class_name, id_of, listed, meant_by
 from gsseg_core.data.label_images import UNKNOWN
 from gsseg_core.errors import LabelMapError
 from gsseg_core.files.json_files import read_json
@@ -58,7 +58,8 @@ def read_new_names(path: str | os.PathLike[str], within: Path | None = None) -> 
     content: Any = (read_yaml if is_yaml else read_json)(path, LabelMapError, within)
     if not isinstance(content, dict):
         raise LabelMapError(f"{path}: holds no object; expected {_EXPECTED}")
-    given = {str(key): _new_name(value, key, path) for key, value in content.items() if type(key) in (str, int)}
+    named = {key: new for key, new in content.items() if type(key) in (str, int)}
+    given = {str(key): _new_name(new, f"{path}: gives {quoted(key)}") for key, new in named.items()}
     if len(given) < len(content):
         raise LabelMapError(f"{path}: has keys that are neither names nor ids; expected {_EXPECTED}")
     return given
@@ -99,9 +100,5 @@ def map_labels(given: Mapping[str, str | None], class_names: Mapping[int, str], 
     return LabelMap(new_ids, dict(sorted(names.items())))
 
 
-def _new_name(value: object, key: object, path: Path) -> str | None:
-    if value is None or value == _IGNORE:
-        return None
-    if flaw := flaw_of_class_name(value):
-        raise LabelMapError(f"{path}: gives {quoted(key)} the name {flaw}")
-    return str(value)
+def _new_name(value: object, who: str) -> str | None:
+    return None if value is None or value == _IGNORE else check_class_name(value, LabelMapError, who)

@@ -40,8 +40,7 @@ class _Loaded(JITCodeLibrary):
 
     def get_pointer_to_function(self, name: str) -> int:
         # numba asks its list of symbols first; of a kernel it wants that alone which Python calls, and which is there.
-        address: int = self._codegen._engine.get_function_address(name)
-        return address
+        return self._codegen._engine.get_function_address(name)
 
     def _get_module_for_linking(self) -> llvm.ModuleRef:
         if self._shared_module is None:

@@ -81,5 +81,4 @@ def make_learner(
     module, kind = (distributed or LEARNERS[name].learner).split(":")
     make = getattr(importlib.import_module(module), kind)
     first = (client,) if distributed else ()
-    learner: Learner = make(*first, scene, num_classes, *make.default_settings(max_steps, seed), **where)
-    return learner
+    return make(*first, scene, num_classes, *make.default_settings(max_steps, seed), **where)

@@ -21,9 +21,8 @@ from gsseg_core.learn.learner_state import OBJECTS_OF_ONE_SESSION, Learnt, State
 from gsseg_core.learn.registry import make_learner
 from gsseg_core.learn.vote_learner import VoteLearner
 from gsseg_core.live.current_codes import Known, current_codes, current_evidence
-from gsseg_core.live.fitting import Report, fitted
 from gsseg_core.live.living_votes import without_groups
-from gsseg_core.live.results import SCENE_CHANGED, Outcome, Rejection
+from gsseg_core.live.results import SCENE_CHANGED, Outcome, Rejection, Report, fitted
 from gsseg_core.live.session_classes import SessionClasses
 from gsseg_core.progress import Stopwatch
 from gsseg_core.raster.view_operator import ViewOperator

@@ -13,7 +13,7 @@ import numpy.typing as npt
 from gsseg_core.errors import CameraFileError, IntrinsicsError, PoseError
 from gsseg_core.files.input_files import IMAGE_SUFFIXES
 from gsseg_core.files.json_files import kind_of
-from gsseg_core.scene.camera import Camera, undistorted_camera
+from gsseg_core.scene.camera import Camera, rigid_motion, undistorted_camera
 from gsseg_core.scene.lens import Lens, LensModel, Projection
 from gsseg_core.scene.undistortion import undistortions
 from gsseg_core.text import clipped, composed, quoted
@@ -107,11 +107,8 @@ def inverse_pose(
     position: npt.NDArray[np.float64],  # (3,)
 ) -> npt.NDArray[np.float64]:
     """World-to-camera (4, 4) of a camera-to-world rotation and position; not rigid where the rotation is none."""
-    pose = np.eye(4)
-    pose[:3, :3] = rotation.T
     with np.errstate(all="ignore"):  # A camera refuses what is NaN or too large.
-        pose[:3, 3] = -rotation.T @ position
-    return pose
+        return rigid_motion(rotation.T, -rotation.T @ position)
 
 
 def stem_of(name: str) -> str:

@@ -9,7 +9,7 @@ from functools import partial
 import numpy as np
 import numpy.typing as npt
 
-from gsseg_core.data.class_names import BACKGROUND_NAME, flaw_of_class_name
+from gsseg_core.data.class_names import BACKGROUND_NAME, check_class_name
 from gsseg_core.data.label_images import UNKNOWN
 from gsseg_core.data.mask_formats.shapes import Drawing
 from gsseg_core.errors import MaskFormatError
@@ -89,9 +89,7 @@ def ids_from_zero(names: Mapping[int, str]) -> dict[int, int]:
 
 def check_name(name: object, where: str) -> str:
     """Return the name of a class, or raise `MaskFormatError` if it is unusable."""
-    if flaw := flaw_of_class_name(name):
-        raise MaskFormatError(f"{where}: a class has the name {flaw}")
-    return str(name)
+    return check_class_name(name, MaskFormatError, f"{where}: a class has")
 
 
 def check_id(value: object, where: str) -> int:

@@ -235,8 +235,7 @@ def scaled(labels: npt.NDArray[T], camera: Camera) -> npt.NDArray[T]:
     if labels.shape == size:
         return labels
     rows, columns = (((np.arange(n) + 0.5) * m / n).astype(np.int64) for n, m in zip(size, labels.shape, strict=True))
-    near: npt.NDArray[T] = labels[rows[:, None], columns]
-    return near
+    return labels[rows[:, None], columns]
 
 
 def _odd(ring: npt.NDArray[np.float64]) -> str:

@@ -125,8 +125,7 @@ class _OnWorkers(Learner):
         self._wait(used, lambda: report(sum(sizes[part.key] for part in parts if part.done())))
         for future in used:
             self._check(future)
-        total: OverViews = self._client.gather(sums[0], direct=self._direct)
-        return total
+        return self._client.gather(sums[0], direct=self._direct)
 
     def _deal(self, views: Mapping[str, View], report: Report) -> list[_Share]:
         """Have every worker prepare its share of the views, unless they have them."""

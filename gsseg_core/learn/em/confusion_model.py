@@ -83,8 +83,7 @@ class ErrorModel:
         """
         if self.evidence.word_plausibility is not None:
             counts = counts[:, self.evidence.informative] @ self.evidence.word_plausibility[self.evidence.informative]
-        expected: np.ndarray = counts * (1 - self.outliers) * self.confusion
-        return expected
+        return counts * (1 - self.outliers) * self.confusion
 
     def m_step(self, counts: np.ndarray) -> None:
         """Set the confusion matrix to its maximiser for expected counts, (K, W) px; rows without any count stay.

@@ -54,8 +54,7 @@ def scene_edges(operator: ViewOperator, scene: GaussianScene, near: np.ndarray |
     channels = _luminance_and_inverse_depth(scene.means, light, operator.ids, ahead)
     wanted = None if near is None else _near_or_sampled(near, camera.height, camera.width)
     light_edges, depth_edges = _differences(*operator.blend_seen(channels, wanted))
-    edges: np.ndarray = _in_units(light_edges) + _in_units(depth_edges)
-    return edges
+    return _in_units(light_edges) + _in_units(depth_edges)
 
 
 def _in_units(edges: np.ndarray) -> np.ndarray:
@@ -73,8 +72,7 @@ def rank_of_unit(count: int) -> int:
 def sampled(image: np.ndarray) -> np.ndarray:
     """Sample a view, (H, W): the pixels of some squares, but for their margins; all pixels of a small one."""
     rows, columns = rows_and_columns_in_sample(*image.shape)
-    some: np.ndarray = image[rows][:, columns].ravel()
-    return some
+    return image[rows][:, columns].ravel()
 
 
 def rows_and_columns_in_sample(height: int, width: int) -> tuple[np.ndarray, np.ndarray]:
@@ -87,8 +85,7 @@ def _in_sample(size: int, margin: int) -> np.ndarray:
     if size < SMALL:
         return np.ones(size, bool)
     first = np.arange(size) % (SQUARE * EVERY) - SQUARE
-    inside: np.ndarray = (first >= margin) & (first < SQUARE - margin)
-    return inside
+    return (first >= margin) & (first < SQUARE - margin)
 
 
 def _near_or_sampled(near: np.ndarray, height: int, width: int) -> np.ndarray:

@@ -55,8 +55,7 @@ class GPUObservation(Observation):
         weighted = torch.bincount(positions.ravel(), of_pixels.ravel(), len(classes))
         self.classes = to_cpu(classes[unknown:].int())
         self.areas, self.weighted_areas = to_cpu(areas[unknown:]), to_cpu(weighted[unknown:])
-        of_classes: torch.Tensor = (positions - unknown).clamp_min(-1).int()
-        return of_classes
+        return (positions - unknown).clamp_min(-1).int()
 
     def _pair_up(self, tiles: TileTensors) -> None:
         """Lift the mask, list the pairs, and keep the entries that pixels with a weight see."""
