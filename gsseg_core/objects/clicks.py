@@ -69,11 +69,7 @@ def click_labels(
         A click inside shows no Gaussian.
     """
     for row, column in (*inside, *outside):
-        if not (0 <= row < camera.height and 0 <= column < camera.width):
-            raise SettingsError(
-                f"view '{camera.name}': pixel is (row {row}, column {column}); expected a row from 0 to "
-                f"{camera.height - 1} and a column from 0 to {camera.width - 1}"
-            )
+        camera.checked_pixel(row, column)
     if not inside or set(inside) & set(outside):
         raise SettingsError(
             f"clicks: {len(inside)} inside, {len(set(inside) & set(outside))} of them outside too; expected at least "

@@ -50,6 +50,11 @@ class Lifted:
         """Measure the borders between the segments of a mask, (H, W) integers, on the surface of the scene, too."""
         return replace(self, borders=borders(labels, self.ids, depth_edges(scene, operator)))
 
+    def of_all(self, num_gaussians: int, data: np.ndarray) -> sparse.csr_matrix:
+        """Write out what stands where the weights do, for all Gaussians, (L, N), and not only those that are seen."""
+        entries = data, self.gaussians[self.weights.indices], self.weights.indptr
+        return sparse.csr_matrix(entries, shape=(len(self), num_gaussians))
+
     def __len__(self) -> int:
         """Count the segments."""
         return len(self.ids)

@@ -73,10 +73,7 @@ class Stack:
 
     def _stacked(self, data: list[np.ndarray]) -> sparse.csr_matrix:
         """Stack what stands where the weights of each view do, (n, I)."""
-        rows = []
-        for view, entries in zip(self.views, data, strict=True):
-            at = view.gaussians[view.weights.indices], view.weights.indptr
-            rows.append(sparse.csr_matrix((entries, *at), shape=(len(view), self.num_gaussians)))
+        rows = [view.of_all(self.num_gaussians, entries) for view, entries in zip(self.views, data, strict=True)]
         return sparse.vstack(rows, format="csr")
 
 

@@ -102,8 +102,7 @@ class _Segments:
         blocks = [sparse.csr_matrix((0, num_gaussians), dtype=np.float32)]
         for name in sorted(views):
             one = views[name]
-            entries = one.weights.data, one.gaussians[one.weights.indices], one.weights.indptr
-            blocks.append(sparse.csr_matrix(entries, shape=(len(one), num_gaussians))[one.ids != 0])
+            blocks.append(one.of_all(num_gaussians, one.weights.data)[one.ids != 0])
         stacked, counts = sparse.vstack(blocks, format="csr"), [block.shape[0] for block in blocks]
         view = np.unique(np.repeat(np.arange(len(blocks)), counts), return_inverse=True)[1]
         return cls(stacked.T.tocsr(), view, sums(stacked, 1), settings)

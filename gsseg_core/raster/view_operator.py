@@ -8,7 +8,7 @@ from typing import NamedTuple
 import numpy as np
 
 from gsseg_core.data.label_evidence import LabelEvidence
-from gsseg_core.errors import MaskFormatError, SceneValueError, SettingsError
+from gsseg_core.errors import MaskFormatError, SceneValueError
 from gsseg_core.files.limits import MAX_LABEL
 from gsseg_core.raster.constants import BLOCK
 from gsseg_core.raster.objects_alone import ObjectsAlone
@@ -174,19 +174,13 @@ class ViewOperator(ViewRenderer):
         SettingsError
             The pixel is not in the image, or only one of its coordinates is given.
         """
-        height, width, pixel = self.camera.height, self.camera.width, None
-        if row is not None or column is not None:
-            if row is None or column is None or not (0 <= row < height and 0 <= column < width):
-                raise SettingsError(
-                    f"view '{self.camera.name}': pixel is (row {row}, column {column}); "
-                    f"expected a row from 0 to {height - 1} and a column from 0 to {width - 1}"
-                )
-            pixel = row, column
+        whole = row is None and column is None
+        pixel = None if whole else self.camera.checked_pixel(row, column)
         pixels, rows, weights = self._weights(pixel)
         if pixel is None:  # Of each pixel they come nearest first, and a stable sort keeps that order.
             order = np.argsort(pixels, kind="stable")
         else:
-            order = np.flatnonzero(pixels == pixel[0] * width + pixel[1])
+            order = np.flatnonzero(pixels == pixel[0] * self.camera.width + pixel[1])
         return Weights(pixels[order], self.ids[rows[order]], weights[order])
 
     @abstractmethod

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from gsseg_core.errors import IntrinsicsError, MaskSizeError, PoseError
+from gsseg_core.errors import IntrinsicsError, MaskSizeError, PoseError, SettingsError
 from gsseg_core.files.input_files import check_pixels
 from gsseg_core.files.limits import LIMITS
 from gsseg_core.scene.lens import MODELS_BY_NAME, Lens
@@ -126,6 +126,15 @@ class Camera:
                 f"{source}: mask is {width} x {height} pixels; expected {expected[0]} x {expected[1]}, the size "
                 f"of {self._who} (masks like this one are never resized)"
             )
+
+    def checked_pixel(self, row: int | None, column: int | None) -> tuple[int, int]:
+        """Return row and column, or raise `SettingsError` unless that is a pixel of the view."""
+        if row is None or column is None or not (0 <= row < self.height and 0 <= column < self.width):
+            raise SettingsError(
+                f"view '{self.name}': pixel is (row {row}, column {column}); expected a row from 0 to "
+                f"{self.height - 1} and a column from 0 to {self.width - 1}"
+            )
+        return row, column
 
     @property
     def _who(self) -> str:
