@@ -15,20 +15,13 @@ import numpy as np
 from gsseg_core.csr_rows import CSRRows, largest
 from gsseg_core.data.class_names import check_class_names, class_name
 from gsseg_core.data.object_tree import ObjectTree
+from gsseg_core.data.segmentation_file import FORMAT, read_segmentation
+from gsseg_core.data.segmentation_file import REMOVED as REMOVED
+from gsseg_core.data.segmentation_file import UNOBSERVED as UNOBSERVED
 from gsseg_core.data.view import spread
 from gsseg_core.errors import SettingsError, StateMismatchError
 from gsseg_core.files.limits import MAX_LABEL
-from gsseg_core.files.npz_files import (
-    UnfitError,
-    WithZeros,
-    check_evidence,
-    check_shares,
-    check_temperature,
-    class_names_of,
-    open_npz,
-    temperature_of,
-    write_npz,
-)
+from gsseg_core.files.npz_files import WithZeros, check_evidence, check_shares, check_temperature, write_npz
 from gsseg_core.files.run_folder import settle
 from gsseg_core.learn.temperature import tempered, tempered_rows
 from gsseg_core.raster.view_operator import ViewOperator
@@ -43,10 +36,6 @@ from gsseg_core.spatial.row_order import inverse
 from gsseg_core.text import clipped
 
 T = TypeVar("T")
-UNOBSERVED, REMOVED = -1, -2
-"""Labels of Gaussians of which nothing is known, and of those that the filter or carving took out."""
-
-FORMAT = "gsseg-segmentation-1"
 _FIRST_ONE = threading.Lock()  # of several threads that ask for what is blended, one computes it
 
 
@@ -382,24 +371,4 @@ class Segmentation:
         """
         path = Path(path)
         settle(path.parent)
-        with open_npz(path, "a segmentation.npz", (FORMAT,), scene.digest) as (file, header):
-            names, temperature = class_names_of(header), temperature_of(header)
-            if 0 not in names:
-                raise UnfitError(f"class_names lack 0, the background; found {clipped(list(names))}")
-            n, k = len(scene), len(names)
-            labels = file.expect("labels", np.int32, (n,))
-            shares = file.expect_rows("probabilities", np.float32, (n, k))
-            clustered = file.expect("clustered", bool, (n,))
-            learnt = file.expect_rows("learnt", np.float32, (int(clustered.sum()), k))
-            unknown_ids = np.setdiff1d(labels, [REMOVED, UNOBSERVED, *names])
-            if unknown_ids.size:
-                raise UnfitError(
-                    f"array labels holds {clipped(unknown_ids[:9].tolist())}; expected ids of its {k} classes, or "
-                    f"{UNOBSERVED} (unobserved) or {REMOVED} (removed)"
-                )
-            if "class_ids" in file.names and file.expect("class_ids", np.int32, (k,)).tolist() != list(names):
-                raise UnfitError("array class_ids holds other ids than class_names of its header; expected the same")
-            check_shares("probabilities", shares)
-            check_shares("learnt", learnt)
-            tree = ObjectTree.read(file, header, n, k)
-        return cls(labels, shares, names, scene.digest, clustered, learnt, temperature, scene.ids, tree)
+        return cls(**read_segmentation(path, scene.digest, len(scene)), scene_digest=scene.digest, ids=scene.ids)

@@ -1,0 +1,48 @@
+"""What `segmentation.npz` holds, read and checked; `gsseg_core.segmentation` makes the result of it, and writes it."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from gsseg_core.data.object_tree import ObjectTree
+from gsseg_core.files.npz_files import UnfitError, check_shares, class_names_of, open_npz, temperature_of
+from gsseg_core.text import clipped
+
+UNOBSERVED, REMOVED = -1, -2
+"""Labels of Gaussians of which nothing is known, and of those that the filter or carving took out."""
+
+FORMAT = "gsseg-segmentation-1"
+
+
+def read_segmentation(path: Path, digest: str, num_gaussians: int) -> dict[str, Any]:
+    """Read the file of a segmentation of the scene with this digest: arrays, names and the like, by `Segmentation`'s.
+
+    Raises `StateFileError` where it is missing or damaged, or holds what no segmentation holds; `StateMismatchError`
+    where it belongs to another scene.
+    """
+    with open_npz(path, "a segmentation.npz", (FORMAT,), digest) as (file, header):
+        names, temperature = class_names_of(header), temperature_of(header)
+        if 0 not in names:
+            raise UnfitError(f"class_names lack 0, the background; found {clipped(list(names))}")
+        n, k = num_gaussians, len(names)
+        labels = file.expect("labels", np.int32, (n,))
+        shares = file.expect_rows("probabilities", np.float32, (n, k))
+        clustered = file.expect("clustered", bool, (n,))
+        learnt = file.expect_rows("learnt", np.float32, (int(clustered.sum()), k))
+        unknown_ids = np.setdiff1d(labels, [REMOVED, UNOBSERVED, *names])
+        if unknown_ids.size:
+            raise UnfitError(
+                f"array labels holds {clipped(unknown_ids[:9].tolist())}; expected ids of its {k} classes, or "
+                f"{UNOBSERVED} (unobserved) or {REMOVED} (removed)"
+            )
+        if "class_ids" in file.names and file.expect("class_ids", np.int32, (k,)).tolist() != list(names):
+            raise UnfitError("array class_ids holds other ids than class_names of its header; expected the same")
+        check_shares("probabilities", shares)
+        check_shares("learnt", learnt)
+        return {
+            "labels": labels, "shares": shares, "class_names": names, "clustered": clustered, "learnt": learnt,
+            "temperature": temperature, "tree": ObjectTree.read(file, header, n, k),
+        }  # fmt: skip
