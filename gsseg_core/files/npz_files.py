@@ -50,6 +50,15 @@ class Header(NamedTuple):
         """Take shape and type of an array."""
         return cls(array.shape, array.dtype)
 
+    def require(self, name: str, dtype: npt.DTypeLike, shape: tuple[int | None, ...]) -> None:
+        """Raise `UnfitError` unless the array of this name has a type and a shape, None being any length."""
+        matches = len(self.shape) == len(shape) and all(
+            want in (None, size) for want, size in zip(shape, self.shape, strict=True)
+        )
+        if self.dtype != np.dtype(dtype) or not matches:
+            sizes = ", ".join("any" if size is None else str(size) for size in shape) + "," * (len(shape) == 1)
+            raise UnfitError(f"array {name} is {self}; expected {np.dtype(dtype)} of shape ({sizes})")
+
     def __str__(self) -> str:
         """Type and shape, for messages."""
         return clipped(f"{self.dtype} of shape {self.shape}")
@@ -72,38 +81,25 @@ class NpzArrays:
 
     def header(self, name: str) -> Header:
         """Read shape and type of an array from its header; `ValueError` if it is missing or its header broken."""
-        if name not in self.names:
-            raise ValueError(f"there is no array {name!r}")
-        with self._archive.open(name + _SUFFIX) as member:
-            return _read_header(member, name)
+        with self._open(name) as member:
+            return _read_header(member, name)[0]
 
     def expect(self, name: str, dtype: npt.DTypeLike, shape: tuple[int | None, ...]) -> npt.NDArray[Any]:
         """Read an array of a type and shape, None being any length; `UnfitError` if it is another."""
-        self._check(name, dtype, shape)
+        self.header(name).require(name, dtype, shape)
         return self.read(name)
-
-    def _check(self, name: str, dtype: npt.DTypeLike, shape: tuple[int | None, ...]) -> None:
-        header = self.header(name)
-        matches = len(header.shape) == len(shape) and all(
-            want in (None, size) for want, size in zip(shape, header.shape, strict=True)
-        )
-        if header.dtype != np.dtype(dtype) or not matches:
-            sizes = ", ".join("any" if size is None else str(size) for size in shape) + "," * (len(shape) == 1)
-            raise UnfitError(f"array {name} is {header}; expected {np.dtype(dtype)} of shape ({sizes})")
 
     def expect_rows(self, name: str, dtype: npt.DTypeLike, shape: tuple[int | None, int | None]) -> CSRRows:
         """Read an array of which most is zero, as `expect` does; its zeros are never in memory all at once."""
-        self._check(name, dtype, shape)
-        with self._archive.open(name + _SUFFIX) as member:
-            version = np.lib.format.read_magic(member)
-            (num_rows, num_columns), by_column, found = _HEADERS[version](member)
+        with self._open(name) as member:
+            header, by_column = _read_header(member, name)
+            header.require(name, dtype, shape)
             if by_column:
                 return CSRRows.from_dense(self.read(name))
-            parts = [CSRRows.empty(0, dtype)]
+            (num_rows, num_columns), parts = header.shape, [CSRRows.empty(0, dtype)]
             for some in slices(num_rows, num_columns):
-                size = (some.stop - some.start) * num_columns
-                content = member.read(size * found.itemsize)
-                if len(content) < size * found.itemsize:
+                size = (some.stop - some.start) * num_columns * header.dtype.itemsize
+                if len(content := member.read(size)) < size:
                     raise ValueError(f"array {name!r} is shorter than its header says")
                 parts.append(CSRRows.from_dense(np.frombuffer(bytearray(content), dtype).reshape(-1, num_columns)))
             _check_end(member, name)
@@ -130,10 +126,15 @@ class NpzArrays:
 
     def read(self, name: str) -> npt.NDArray[Any]:
         """Read an array, whose `header` the caller has checked."""
-        with self._archive.open(name + _SUFFIX) as member:
+        with self._open(name) as member:
             array: npt.NDArray[Any] = np.lib.format.read_array(member, allow_pickle=False)
             _check_end(member, name)
             return array
+
+    def _open(self, name: str) -> IO[bytes]:
+        if name not in self.names:
+            raise ValueError(f"there is no array {name!r}")
+        return self._archive.open(name + _SUFFIX)
 
     def text(self, name: str) -> str:
         """Read an array that is one text, of `Limits.max_json_bytes` at most."""
@@ -151,12 +152,13 @@ def _check_end(member: IO[bytes], name: str) -> None:
         raise ValueError(f"array {name!r} is longer than its header says")
 
 
-def _read_header(member: Any, name: str) -> Header:
+def _read_header(member: Any, name: str) -> tuple[Header, bool]:
+    """Read shape and type of an array, and whether it lies in its file column after column."""
     try:
         version = np.lib.format.read_magic(member)
         if version not in _HEADERS:
             raise ValueError(f"version {version}")
-        shape, _, dtype = _HEADERS[version](member)
+        shape, by_column, dtype = _HEADERS[version](member)
     except (ValueError, SyntaxError, TypeError, tokenize.TokenError) as error:
         raise ValueError(f"array {name!r} is none of NumPy's ({clipped(error)})") from error
     header = Header(shape, dtype)
@@ -165,7 +167,7 @@ def _read_header(member: Any, name: str) -> Header:
         raise ValueError(f"array {name!r} is {header}; expected numbers")
     if math.prod(header.shape) * header.dtype.itemsize > LIMITS.max_npz_bytes:
         raise ValueError(f"array {name!r} is {header}; expected at most {LIMITS.max_npz_bytes:,} bytes")
-    return header
+    return header, by_column
 
 
 def whole_number(value: object, what: str, least: int, most: int) -> int:
