@@ -20,11 +20,10 @@ from importlib import metadata
 from itertools import groupby
 from pathlib import Path
 
-from gsseg_core.cli.shared import add_dataparser, add_device, add_quiet, load_kernels
+from gsseg_core.cli.shared import add_dataparser, add_device, add_quiet, load_kernels, placed
 from gsseg_core.cli.terminal import note, tell
 from gsseg_core.errors import GssegError, SettingsError
 from gsseg_core.kernels import kernel_cache
-from gsseg_core.progress import progress_bars
 
 DESCRIPTION = """
 Prints the versions of gsseg, Python and its packages, the devices, whether the kernels run and where they are cached,
@@ -105,18 +104,14 @@ def run(options: argparse.Namespace) -> int:
 
 def _examine_frame(options: argparse.Namespace) -> int:
     """Look whether the cameras of a dataset fit a scene, and print what makes them fit."""
-    from gsseg_core.align.placing import place
     from gsseg_core.data.dataset import Dataset
     from gsseg_core.scene.gaussian_scene import GaussianScene
 
     scene, dataset = GaussianScene.load(options.scene), Dataset(options.path, options.labels)
     load_kernels(options.quiet, options.device)
-    with progress_bars(options.quiet) as progress:
-        placed = place(
-            scene, dataset, align=True, dataparser=options.dataparser, device=options.device, progress=progress
-        )
-    tell(placed.describe())
-    return 0 if placed.fits else 2
+    found = placed(options, scene, dataset, align=True)
+    tell(found.describe())
+    return 0 if found.fits else 2
 
 
 def examine(say: Callable[[str], object] = lambda text: None) -> list[Finding]:

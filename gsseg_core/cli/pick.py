@@ -6,10 +6,9 @@ import argparse
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from gsseg_core.cli.shared import add_collision, add_format, add_scene, load_kernels
+from gsseg_core.cli.shared import add_collision, add_format, add_scene, load_kernels, placed
 from gsseg_core.cli.terminal import tell
 from gsseg_core.errors import SettingsError
-from gsseg_core.progress import progress_bars
 from gsseg_core.scene.scene_writers import DEFAULT, SCENE_WRITERS
 from gsseg_core.text import quoted
 
@@ -54,7 +53,6 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(options: argparse.Namespace) -> int:
     """Pick, and say what was written."""
-    from gsseg_core.align.placing import place
     from gsseg_core.data.dataset import Dataset
     from gsseg_core.data.view import spread
     from gsseg_core.export.collision import check_collision
@@ -70,11 +68,8 @@ def run(options: argparse.Namespace) -> int:
     file = f"object{SCENE_WRITERS[options.format].suffixes[0]}"
     out, scene = Path(options.out), GaussianScene.load(options.scene)
     load_kernels(options.quiet, options.device)
-    with progress_bars(options.quiet) as progress:
-        placed = place(
-            scene, dataset, align=options.align, dataparser=options.dataparser, device=options.device, progress=progress
-        )
-    cameras = {camera.name: camera for camera in placed.dataset.cameras}
+    posed = placed(options, scene, dataset, align=options.align).dataset
+    cameras = {camera.name: camera for camera in posed.cameras}
     with staged_run(out, "pick", places=(file, "object.obj", "pick.npz", "pick.png", "next.png")) as run:
         picked = _picked(options, scene, cameras, dataset)
         _write(options, scene, picked, cameras[options.views[0]], run.folder / file, run.id)

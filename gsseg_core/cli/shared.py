@@ -7,11 +7,18 @@ import os
 from collections.abc import Callable
 from contextlib import suppress
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from gsseg_core.cli.terminal import note
 from gsseg_core.errors import GssegError, PathTakenError, SettingsError
+from gsseg_core.progress import progress_bars
 from gsseg_core.raster.backends import devices, rasteriser_of
 from gsseg_core.scene.scene_writers import SCENE_WRITERS
+
+if TYPE_CHECKING:
+    from gsseg_core.align.placing import Placed
+    from gsseg_core.data.dataset import Dataset
+    from gsseg_core.scene.gaussian_scene import GaussianScene
 
 LABELS = "labels"  # folder of the masks in a dataset, unless `--labels` names another
 
@@ -66,6 +73,16 @@ def labels_path(options: argparse.Namespace) -> str:
     is_elsewhere = not os.path.exists(os.path.join(options.data, labels)) and os.path.exists(labels)
     # The default is a folder of the dataset only: masks that lie here by chance were not asked for.
     return os.path.abspath(labels) if is_elsewhere and labels != LABELS else labels
+
+
+def placed(options: argparse.Namespace, scene: GaussianScene, dataset: Dataset, *, align: bool) -> Placed:
+    """Put the cameras of a dataset where they are in a scene, by the options of `add_frame`, and show progress."""
+    from gsseg_core.align.placing import place
+
+    with progress_bars(options.quiet) as progress:
+        return place(
+            scene, dataset, align=align, dataparser=options.dataparser, device=options.device, progress=progress
+        )
 
 
 def note_frame(options: argparse.Namespace) -> None:

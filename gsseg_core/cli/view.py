@@ -11,10 +11,9 @@ from pathlib import Path
 from types import ModuleType
 from typing import TYPE_CHECKING
 
-from gsseg_core.cli.shared import add_device, add_frame, add_quiet, load_kernels, note_frame
+from gsseg_core.cli.shared import add_device, add_frame, add_quiet, load_kernels, note_frame, placed
 from gsseg_core.cli.terminal import note, tell
 from gsseg_core.errors import SettingsError
-from gsseg_core.progress import progress_bars
 from gsseg_core.text import counted
 
 if TYPE_CHECKING:
@@ -60,7 +59,6 @@ def run(options: argparse.Namespace) -> int:
 
 
 def _show(options: argparse.Namespace, listener: Listener, viewer_module: ModuleType) -> int:
-    from gsseg_core.align.placing import place
     from gsseg_core.scene.gaussian_scene import GaussianScene
     from gsseg_core.segmentation import Segmentation
     from gsseg_core.viewer.learnt_views import LearntFrom
@@ -76,11 +74,7 @@ def _show(options: argparse.Namespace, listener: Listener, viewer_module: Module
     if dataset:
         if segmentation:
             note_frame(options)
-        with progress_bars(options.quiet) as progress:
-            dataset = place(
-                scene, dataset, align=options.align, dataparser=options.dataparser, device=options.device,
-                progress=progress,
-            ).dataset  # fmt: skip
+        dataset = placed(options, scene, dataset, align=options.align).dataset
     if dataset and not options.ros:  # The node's ids are as they are.
         class_ids = class_ids or list(dataset.class_ids)
         dataset = dataset.numbered(class_ids)

@@ -74,7 +74,4 @@ def frame_of_training(folder: Path, dataparser: Path) -> Similarity | None:
 
 def find_cameras(folder: Path) -> tuple[CameraFormat, Path] | None:
     """Find the cameras of a dataset folder, and of which format they are; None where it has none."""
-    for camera_format in CAMERA_FORMATS:
-        if path := camera_format.find(folder):
-            return camera_format, path
-    return None
+    return next(((known, path) for known in CAMERA_FORMATS if (path := known.find(folder))), None)
