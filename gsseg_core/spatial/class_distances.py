@@ -18,7 +18,7 @@ from gsseg_core.spatial.neighbourhood import Found, Neighbours, nodes_without
 from gsseg_core.spatial.row_order import rows_by_label
 
 MIXED = np.int32(-(2**31))  # stands for the label of a node whose points have several
-NOBODY = MIXED + 1  # the label of no point
+NOBODY = np.int32(MIXED + 1)  # the label of no point
 
 
 def class_distances(neighbours: Neighbours, labels: np.ndarray, num_classes: int) -> np.ndarray:  # (N,) int
@@ -35,8 +35,13 @@ def class_distances(neighbours: Neighbours, labels: np.ndarray, num_classes: int
     wanted = _to_be_found(tree, of_point, before, k)
     neighbours.look_for(wanted)
     radii[of_point == 0], found[of_point == 0] = np.nan, np.nan
-    pure = pure_distances(tree, of_point, wanted, neighbours.radii, neighbours.distances)
-    found[wanted], radii[wanted] = pure[wanted], neighbours.radii[wanted]
+    # Where all neighbours are of a point's own class, these are what is looked for.
+    leaves = len(tree.blocks)
+    of_node = _labels_of_nodes(of_point, leaves)
+    of_leaf = np.where(of_node[leaves:] == MIXED, NOBODY, of_node[leaves:])
+    met = _meet(tree, wanted, neighbours.radii, of_node, of_leaf, of_point, of_point, None)
+    found[wanted] = np.where(met, np.nan, neighbours.distances)[wanted]
+    radii[wanted] = neighbours.radii[wanted]
     for label, members in rows_by_label(of_point).items():
         mixed = np.flatnonzero(wanted[members] & np.isnan(found[members])).astype(np.int32)
         # Where other classes are among the neighbours, more of its own are looked for, farther away.
@@ -59,100 +64,67 @@ def _to_be_found(tree: Tree, labels: np.ndarray, before: Found, k: int) -> np.nd
     members, members_before = (np.bincount(of, minlength=count) for of in (labels, before.labels))
     few = (np.minimum(members - 1, k) != np.minimum(members_before - 1, k))[labels] & (labels > 0)
     wanted |= few
-    still = nodes_without(moved, len(tree.blocks))
-    _want_those_near(tree, moved, still, labels, before.labels, before.radii, wanted)
-    return wanted
+    leaves, asked = len(tree.blocks), (labels > 0) & ~wanted
+    # Nodes in which none has moved have nothing to say.
+    still, nothing_moved = nodes_without(moved, leaves), np.ones(leaves, np.int32)
+    return wanted | _meet(tree, asked, before.radii, still, nothing_moved, labels, before.labels, moved)
 
 
 @kernel(parallel=True)
-def _want_those_near(
-    tree: Tree, moved: np.ndarray, still: np.ndarray,  # (n,) bool, (2 L,) int32: 1 for nodes without any that moved
-    labels: np.ndarray, before: np.ndarray, radii: np.ndarray,  # (n,) now; before; squared
-    wanted: np.ndarray,  # (n,) bool, grows
-) -> None:  # fmt: skip
-    """Add the points of which one within the radius has come to their class, or left it."""
+def _meet(
+    tree: Tree, asked: np.ndarray, radii: np.ndarray,  # (n,) bool; (n,) float32, squared
+    of_node: np.ndarray, skipped: np.ndarray,  # (2 L,), (L,) int32: nodes with this number need no look from a leaf
+    labels: np.ndarray, before: np.ndarray,  # (n,) int32, now and before
+    moved: np.ndarray | None,  # (n,) bool
+) -> np.ndarray:  # fmt: skip
+    """Tell which of the points asked for meet within their radius one that has moved into their class or out of it.
+
+    Where nothing is said of moves, these are the points that meet one of another class. Returns (n,) bool.
+    """
     leaves, n = len(tree.blocks), len(labels)
+    met = np.zeros(n, np.bool_)
     for chunk in nb.prange((leaves + LEAF - 1) // LEAF):
         candidates = knn.scratch_for(128)
         for leaf in range(chunk * LEAF, min((chunk + 1) * LEAF, leaves)):
             first, last = leaf_range(leaf, leaves, n)
             widest = np.float32(-1)
             for q in range(first, last):
-                if labels[q] > 0 and not wanted[q] and radii[q] > widest:
+                if asked[q] and radii[q] > widest:
                     widest = radii[q]
             if widest < 0:
                 continue
             box = tree.boxes[leaves + leaf]
-            candidates, found = knn.find_leaves(tree.boxes, box, widest, still, np.int32(1), candidates)
+            candidates, found = knn.find_leaves(tree.boxes, box, widest, of_node, skipped[leaf], candidates)
             for q in range(first, last if found > 0 else first):
-                if labels[q] > 0 and not wanted[q]:
+                if asked[q]:
                     reached = knn.measure(tree, q, radii[q], found, candidates)
-                    wanted[q] = _is_near(moved, labels, before, labels[q], radii[q], reached, leaves, candidates)
+                    met[q] = _is_met(labels, before, moved, labels[q], radii[q], reached, leaves, candidates)
+    return met
 
 
 @called_by_kernels
-def _is_near(
-    moved: np.ndarray, labels: np.ndarray, before: np.ndarray, label: int, radius: float, reached: int, leaves: int,
-    candidates: knn.LeafCandidates,
+def _is_met(
+    labels: np.ndarray, before: np.ndarray, moved: np.ndarray | None, label: int, radius: float, reached: int,
+    leaves: int, candidates: knn.LeafCandidates,
 ) -> bool:  # fmt: skip
-    """Whether a point that was measured and is within the radius has come to a class, or left it."""
+    """Whether such a point, as `_meet` says, is among those that were measured and are within the radius."""
     for h in range(reached):
         first, last = leaf_range(candidates.leaves[candidates.reached[h]], leaves, labels.shape[0])
         within = at_most(load_row(candidates.near, h), radius)
         for i in range(last - first):
-            p = first + i
-            if (within >> i) & 1 and moved[p] and (labels[p] == label or before[p] == label):
-                return True
+            if (within >> i) & 1:
+                p = first + i
+                if moved is None:
+                    if labels[p] != label:
+                        return True
+                elif moved[p] and (labels[p] == label or before[p] == label):
+                    return True
     return False
 
 
-@kernel(parallel=True)
-def pure_distances(
-    tree: Tree, labels: np.ndarray, wanted: np.ndarray, radii: np.ndarray, distances: np.ndarray
-) -> np.ndarray:
-    """Distances of those points that are wanted, whose neighbours within the radius all have their label; else NaN.
-
-    All arrays are (n,) in tree order, the labels of int32.
-    """
-    leaves, n = len(tree.blocks), len(labels)
-    out, of_node = np.full(n, np.nan), _labels_of_nodes(labels, leaves)
-    for chunk in nb.prange((leaves + LEAF - 1) // LEAF):
-        candidates = knn.scratch_for(128)
-        for leaf in range(chunk * LEAF, min((chunk + 1) * LEAF, leaves)):
-            first, last = leaf_range(leaf, leaves, n)
-            widest, label = np.float32(-1), of_node[leaves + leaf]
-            for q in range(first, last):
-                widest = max(widest, radii[q]) if wanted[q] else widest
-            if widest < 0:
-                continue
-            # A node of the leaf's own label has nothing to say; a leaf of several labels has none.
-            skipped = label if label != MIXED else NOBODY
-            box = tree.boxes[leaves + leaf]
-            candidates, found = knn.find_leaves(tree.boxes, box, widest, of_node, skipped, candidates)
-            for q in range(first, last):
-                if wanted[q]:
-                    reached = knn.measure(tree, q, radii[q], found, candidates)
-                    if _is_pure(labels, labels[q], radii[q], reached, leaves, candidates):
-                        out[q] = distances[q]
-    return out
-
-
-@called_by_kernels
-def _is_pure(
-    labels: np.ndarray, label: int, radius: float, reached: int, leaves: int, candidates: knn.LeafCandidates
-) -> bool:
-    """Whether all points measured and within the radius have a label."""
-    for h in range(reached):
-        first, last = leaf_range(candidates.leaves[candidates.reached[h]], leaves, labels.shape[0])
-        within = at_most(load_row(candidates.near, h), radius)
-        for i in range(last - first):
-            if (within >> i) & 1 and labels[first + i] != label:
-                return False
-    return True
-
-
-@called_by_kernels
+@kernel
 def _labels_of_nodes(labels: np.ndarray, leaves: int) -> np.ndarray:
+    """Label that all points of a node have, (2 L,) int32, or `MIXED`."""
     of_node = np.empty(2 * leaves, np.int32)
     for leaf in range(leaves):
         first, last = leaf_range(leaf, leaves, labels.shape[0])
