@@ -114,7 +114,7 @@ class CSRRows(NamedTuple):
     def take(self, ids: np.ndarray) -> CSRRows:  # (M,)
         """Copy some rows: M of them."""
         rows = CSRRows.room_for(np.diff(self.indptr)[ids], self.data.dtype)
-        _take(self, ids, rows)
+        _copy_rows(self, ids, self, rows)
         return rows
 
     def replaced(self, rows: np.ndarray, others: CSRRows) -> CSRRows:  # (N,) int64
@@ -136,7 +136,7 @@ class CSRRows(NamedTuple):
         lengths = np.empty(self.num_rows, np.int64)
         _sort_and_add(moved, lengths)
         made = CSRRows.room_for(lengths, self.data.dtype)
-        _take(moved, np.arange(self.num_rows), made)
+        _copy_rows(moved, np.arange(self.num_rows), moved, made)
         return made
 
     def with_rows(self, ids: np.ndarray, rows: CSRRows) -> CSRRows:  # (M,) distinct; M rows of the same pattern
@@ -217,28 +217,18 @@ def _normalise(rows: CSRRows) -> None:
 
 
 @kernel(parallel=True)
-def _take(rows: CSRRows, ids: np.ndarray, taken: CSRRows) -> None:
-    indptr, indices, data = rows
-    taken_indptr, taken_indices, taken_data = taken
-    last = ids.shape[0] - 1
-    for m in nb.prange(ids.shape[0]):
-        # Rows are anywhere in memory: they are asked for before they are needed.
-        prefetch(indptr, ids[min(m + 2 * AHEAD, last)])
-        begin = indptr[ids[min(m + AHEAD, last)]]
-        prefetch(indices, begin)
-        prefetch(data, begin)
-        first = indptr[ids[m]]
-        for j in range(taken_indptr[m + 1] - taken_indptr[m]):
-            z = taken_indptr[m] + j
-            taken_indices[z], taken_data[z] = indices[first + j], data[first + j]
-
-
-@kernel(parallel=True)
 def _copy_rows(rows: CSRRows, which: np.ndarray, others: CSRRows, made: CSRRows) -> None:
+    """Copy into each row, as far as it reaches, the one of some others that `which` says, or at -1 its own."""
     indptr, indices, data = rows
     other_indptr, other_indices, other_data = others
     made_indptr, made_indices, made_data = made
+    last = which.shape[0] - 1
     for i in nb.prange(which.shape[0]):
+        # Others are anywhere in memory: they are asked for before they are needed.
+        prefetch(other_indptr, max(which[min(i + 2 * AHEAD, last)], 0))
+        begin = other_indptr[max(which[min(i + AHEAD, last)], 0)]
+        prefetch(other_indices, begin)
+        prefetch(other_data, begin)
         first = indptr[i] if which[i] < 0 else other_indptr[which[i]]
         for j in range(made_indptr[i + 1] - made_indptr[i]):
             z = made_indptr[i] + j
