@@ -14,7 +14,7 @@ from gsseg_core.data.dataset import Dataset
 from gsseg_core.data.view import View
 from gsseg_core.errors import SettingsError
 from gsseg_core.learn.learner import UNITS, VOTE_UNIT
-from gsseg_core.learn.learner_state import Learnt, State
+from gsseg_core.learn.learner_state import Learnt
 from gsseg_core.learn.vote_learner import VoteLearner
 from gsseg_core.live.results import Outcome, Rejection
 from gsseg_core.live.session import LiveSession
@@ -107,7 +107,9 @@ class PerViewSession(LiveSession):
             if moved and forgotten:  # What is left once the views have gone is of those that are no longer kept.
                 for name in names:
                     self._live.retract(name)
-                self._live.adopt(_with_numbers(self._live.state(), repair.successors))
+                left, most = self._live.state(), int(repair.successors.max()) + 1
+                votes = _added_up(left.votes, repair.successors).nonzero()
+                self._live.adopt(replace(left, votes=votes, num_classes=max(left.num_classes, most)))
                 for view in views.values():
                     self._live.observe(view)
             else:
@@ -185,11 +187,6 @@ class PerViewSession(LiveSession):
         super()._drop_old_views()
         for name in [name for name in self._table.views if name not in self._live.views]:
             self._table.forget(name)
-
-
-def _with_numbers(state: State, successors: np.ndarray) -> State:  # (K',)
-    votes = _added_up(state.votes, successors).nonzero()
-    return replace(state, votes=votes, num_classes=max(state.num_classes, int(successors.max()) + 1))
 
 
 def _renumbered(learnt: Learnt, successors: np.ndarray) -> Learnt:

@@ -115,11 +115,8 @@ class Place:
     def only(self, suffix: str) -> Path | None:
         """Find the only file with a suffix, the place itself perhaps; None where single views have masks beside it."""
         files = [path for path in self.entries or [self.path] if path.suffix.lower() == suffix and path.is_file()]
-        return files[0] if len(files) == 1 and not self._has_views else None
-
-    @cached_property
-    def _has_views(self) -> bool:
-        return any(path.suffix.lower() != ".xml" and view_of(path.name, self.stems) for path in self.entries)
+        of_views = (path for path in self.entries if path.suffix.lower() != ".xml" and view_of(path.name, self.stems))
+        return files[0] if len(files) == 1 and next(of_views, None) is None else None
 
     def holds(self, path: Path, pattern: bytes) -> bool:
         """Tell whether a file begins with a pattern, a regular expression, within its first 4096 bytes."""

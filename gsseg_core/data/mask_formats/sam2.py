@@ -11,16 +11,12 @@ from collections import defaultdict
 from functools import partial
 from pathlib import Path
 
-import numpy as np
-import numpy.typing as npt
-
 from gsseg_core.data.mask_formats.images import paint_objects
 from gsseg_core.data.mask_formats.masks import MaskSet, ViewMask
 from gsseg_core.data.mask_formats.place import Place
 from gsseg_core.errors import MaskFormatError
 from gsseg_core.files.input_files import list_folder
 from gsseg_core.files.limits import MAX_LABEL
-from gsseg_core.scene.camera import Camera
 
 
 def is_sam2(place: Place) -> bool:
@@ -38,9 +34,8 @@ def read_sam2(place: Place) -> MaskSet:
     for number, files in sorted(objects.items(), reverse=True):
         for view, path in files.items():
             views[view][number + shift] = path
-    return MaskSet(
-        {view: ViewMask(f"{place.path}, view '{view}'", partial(_read, place, files)) for view, files in views.items()}
-    )
+    reads = {view: partial(paint_objects, list(files.items()), within=place.within) for view, files in views.items()}
+    return MaskSet({view: ViewMask(f"{place.path}, view '{view}'", read) for view, read in reads.items()})
 
 
 def _is_object(folder: Path) -> bool:
@@ -56,7 +51,3 @@ def _objects(place: Place) -> dict[int, dict[str, Path]]:
         if masks := place.views((path.name, path) for path in files):
             found[int(folder.name)] = masks
     return found
-
-
-def _read(place: Place, files: dict[int, Path], camera: Camera) -> npt.NDArray[np.int32]:
-    return paint_objects(files.items(), camera, place.within)
