@@ -9,8 +9,9 @@ from gsseg_core.cli.terminal import tell
 
 DESCRIPTION = """
 Adds up saved states of one scene, as robots save them with ~/save_state: votes are added exactly, as if all masks had
-come to one robot, and views of the same name are told apart. Learnt codes are those of one state's views, and are left
-out: load the result and learn again.
+come to one robot, and views of the same name are told apart. A view that two states hold counts twice, as its votes
+cannot be told without the scene: ~/merge_states counts it once. Learnt codes are those of one state's views, and are
+left out: load the result and learn again.
 """
 EXAMPLES = """
   gsseg merge first_robot.npz second_robot.npz -o both.npz
@@ -27,7 +28,7 @@ def run(options: argparse.Namespace) -> int:
     """Merge, and say what came together."""
     from gsseg_core.files.atomic import check_writable
     from gsseg_core.learn.learner_state import State
-    from gsseg_core.learn.merged_states import Saved, merge_states
+    from gsseg_core.learn.merged_states import Saved, merge_states, shared_views
     from gsseg_core.text import counted
 
     check_writable(options.out)
@@ -38,4 +39,11 @@ def run(options: argparse.Namespace) -> int:
     merged.save(options.out, saved[0].scene)
     tell(f"{counted(merged.num_fused, 'view')} of {counted(len(saved), 'state')}, {len(merged.views):,} with masks: "
          f"{options.out}")  # fmt: skip
+    twice = 0
+    for number, one in enumerate(saved):
+        before = [view for other in saved[:number] for view in other.state.views]
+        twice += len(shared_views(one.state.views, before))
+    if twice:
+        counts = "count" if twice > 1 else "counts"
+        tell(f"{counted(twice, 'view')} {counts} twice: of states that one robot has saved, merge the last alone")
     return 0

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import itertools
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import replace
 from typing import NamedTuple
 
@@ -26,11 +26,19 @@ class Saved(NamedTuple):
     state: State
 
 
-def merge_states(saved: Sequence[Saved]) -> State:  # at least one
-    """Add up states of one scene: votes exactly, views one after the other, class names together.
+def merge_states(saved: Sequence[Saved], without: Callable[[State, list[str]], State] | None = None) -> State:
+    """Add up states of one scene, at least one: votes exactly, views one after the other, class names together.
 
     Views of the same name are told apart: the later one is called like "view_2". Codes that were learnt are those of
     the views of one state, and go.
+
+    Parameters
+    ----------
+    saved : sequence of Saved
+        In the order in which they are added.
+    without : callable, optional
+        Takes views, by name, and their votes out of a state. With it, a view that several states keep counts once;
+        otherwise as often as they keep it, as without the scene nobody knows its votes.
 
     Raises
     ------
@@ -44,7 +52,7 @@ def merge_states(saved: Sequence[Saved]) -> State:  # at least one
     first = saved[0]
     names: dict[int, str] = {}
     views: dict[str, View] = {}
-    votes = CSRRows.empty(first.state.votes.num_rows, np.int64)
+    votes, num_fused = CSRRows.empty(first.state.votes.num_rows, np.int64), 0
     for number, one in enumerate(saved):
         if one.scene != first.scene or not _is_same_map(one.state.living, first.state.living):
             raise StateMismatchError(
@@ -69,11 +77,13 @@ def merge_states(saved: Sequence[Saved]) -> State:  # at least one
                     f"{one.source}: {other.source} has all its votes and views already, which would count twice; "
                     "expected each state once"
                 )
-        votes = votes.plus(one.state.votes)
-        for view in one.state.views:
+        shared = shared_views(one.state.views, views.values()) if without else []
+        state = without(one.state, shared) if without and shared else one.state
+        votes, num_fused = votes.plus(state.votes), num_fused + state.num_fused
+        for view in state.views:
             name = next(free for free in _names(view.name) if free not in views)
             views[name] = view if name == view.name else replace(view, camera=replace(view.camera, name=name))
-    num_fused, num_classes = sum(one.state.num_fused for one in saved), max(one.state.num_classes for one in saved)
+    num_classes = max(one.state.num_classes for one in saved)
     # One state alone stays of its kind.
     return replace(
         first.state, votes=votes.nonzero(), num_classes=num_classes, views=[*views.values()], num_fused=num_fused,
@@ -106,19 +116,27 @@ def _brings_nothing(one: State, other: State) -> bool:
     if not one.views:
         alike = one.num_fused == other.num_fused and one.num_classes == other.num_classes
         return alike and all(map(np.array_equal, one.votes, other.votes))
-    known = {view.name: view for view in other.views}
-    return all(_is_among(view, known) for view in one.views)
+    return len(shared_views(one.views, other.views)) == len(one.views)
 
 
-def _is_among(view: View, known: dict[str, View]) -> bool:
-    """Whether a view is there, under its name or one that merging gave it."""
-    return any(_is_same_view(view, known[name]) for name in itertools.takewhile(known.__contains__, _names(view.name)))
+def shared_views(views: Iterable[View], known: Iterable[View]) -> list[str]:
+    """Name the views that are among those known, with the same pose and mask, whatever they are called there.
+
+    Each that is known stands for one: a camera that stands still has several alike.
+    """
+    left: dict[tuple[object, ...], list[View]] = {}
+    for view in known:
+        left.setdefault(_where_from(view), []).append(view)
+    shared = []
+    for view in views:
+        alike = left.get(_where_from(view), [])
+        found = next((other for other in alike if np.array_equal(view.read_labels(), other.read_labels())), None)
+        if found is not None:
+            alike.remove(found)
+            shared.append(view.name)
+    return shared
 
 
-def _is_same_view(one: View, other: View) -> bool:
-    return (
-        one.group == other.group
-        and np.array_equal(one.camera.K, other.camera.K)
-        and np.array_equal(one.camera.world_to_camera, other.camera.world_to_camera)
-        and np.array_equal(one.read_labels(), other.read_labels())
-    )
+def _where_from(view: View) -> tuple[object, ...]:
+    """Group, intrinsics and pose of a view, to look it up by."""
+    return view.group, view.camera.K.tobytes(), view.camera.world_to_camera.tobytes()

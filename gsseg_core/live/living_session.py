@@ -171,8 +171,9 @@ class LivingSession(LiveSession):
     def merge(self, paths: Sequence[str | os.PathLike[str]], within: Path | None = None) -> int:
         """Add what other sessions of the scene have saved to what is known; return how many views came with it.
 
-        Votes are added exactly. What was learnt stays in force until it is learnt again; of several views of one name,
-        the later ones get others, and only the last `max_views` are kept. On any error, nothing has changed.
+        Votes are added exactly, and those of a view that is known already, or is in two of the states, once. What was
+        learnt stays in force until it is learnt again; of several views of one name, the later ones get others, and
+        only the last `max_views` are kept. On any error, nothing has changed.
 
         Raises
         ------
@@ -191,13 +192,22 @@ class LivingSession(LiveSession):
                 state = self._read_state(Path(path), within)
                 self._check_classes(path, state)
                 saved.append(Saved(str(path), digest, replace(state, living=None)))
-            merged = merge_states(saved)
+            merged = merge_states(saved, self._without)
+            self._live.adopt(merged)  # First: with too little memory for it, nothing has changed.
             self._classes.reset(merged.class_names)
             came, self.num_fused = merged.num_fused - self.num_fused, merged.num_fused
-            self._live.adopt(merged)
             self._version += 1
             self._drop_old_views()
         return came
+
+    def _without(self, state: State, names: list[str]) -> State:
+        """Take views and their votes out of a state."""
+        votes = self._no_votes(state.num_classes)
+        votes.adopt(state)
+        for name in names:
+            votes.retract(name)
+        left = votes.state()
+        return replace(state, votes=left.votes, views=left.views, num_fused=state.num_fused - len(names))
 
     def _no_votes(self, num_classes: int) -> LivingVotes:
         return LivingVotes(self._living, num_classes, device=self.device)

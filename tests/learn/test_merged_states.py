@@ -14,8 +14,10 @@ from gsseg_core.data.view import View
 from gsseg_core.errors import StateFileError
 from gsseg_core.live.living_session import LivingSession
 from gsseg_core.live.per_view_session import PerViewSession
+from gsseg_core.raster.vote_total import VoteTotal
 from gsseg_core.scene.gaussian_scene import GaussianScene
-from gsseg_core.scene.scene_delta import SceneDelta
+from gsseg_core.scene.scene_delta import GroupMove, SceneDelta
+from gsseg_core.scene.similarity import Similarity
 
 SCENE, TRUTH = balls_on_a_table()
 VIEWS = clean_views(6)
@@ -113,6 +115,79 @@ def test_a_state_that_was_merged_already_is_refused_when_it_is_merged_again(tmp_
     before = session._live._votes.dense()
     with pytest.raises(StateFileError, match=r"b\.npz: what is known here has all its votes and views already"):
         session.merge([state])
+    np.testing.assert_array_equal(session._live._votes.dense(), before)
+
+
+def test_a_robot_that_sends_its_state_again_and_again_has_each_view_counted_once(tmp_path: Path) -> None:
+    session = load(robot(tmp_path / "own.npz", VIEWS[4:]))
+    for count, came in ((1, 1), (3, 2), (4, 1)):
+        assert session.merge([robot(tmp_path / "other.npz", VIEWS[:count])]) == came
+    assert session.num_fused == session.num_views == 6
+    whole = load(robot(tmp_path / "all.npz", VIEWS))
+    np.testing.assert_array_equal(session._live._votes.dense(), whole._live._votes.dense())
+
+
+def test_own_views_that_come_back_under_other_names_are_known(tmp_path: Path) -> None:
+    own, seen_elsewhere = (
+        robot(tmp_path / "own.npz", VIEWS[:2]),
+        View.from_arrays(VIEWS[5].camera, VIEWS[5].read_labels()),
+    )
+    other = load(
+        robot(tmp_path / "other.npz", [replace(seen_elsewhere, camera=replace(VIEWS[5].camera, name="view0"))])
+    )
+    other.merge([own])
+    assert [view.name for view in other.views] == ["view0", "view0_2", "view1"]
+    other.save(tmp_path / "both.npz")
+    session = load(own)
+    assert session.merge([tmp_path / "both.npz"]) == 1
+    assert [view.name for view in session.views] == ["view0", "view1", "view0_2"]
+    np.testing.assert_array_equal(session._live._votes.dense(), other._live._votes.dense())
+    with pytest.raises(StateFileError, match=r"both\.npz: what is known here has all its votes and views already"):
+        session.merge([tmp_path / "both.npz"])
+
+
+def test_a_camera_that_stands_still_has_as_many_views_as_it_sent(tmp_path: Path) -> None:
+    """Views of one pose and mask are told apart by how many there are."""
+    still = [replace(VIEWS[0], camera=replace(VIEWS[0].camera, name=f"stamp{i}")) for i in range(3)]
+    session = load(robot(tmp_path / "own.npz", [*VIEWS[4:], *still[:2]]))
+    assert session.merge([robot(tmp_path / "other.npz", still)]) == 1
+    whole = load(robot(tmp_path / "all.npz", [*VIEWS[4:], *still]))
+    np.testing.assert_array_equal(session._live._votes.dense(), whole._live._votes.dense())
+
+
+def test_views_of_groups_that_moved_since_are_counted_once(tmp_path: Path) -> None:
+    session = LivingSession(SCENE, NAMES)
+    new = np.arange(len(SCENE), len(SCENE) + 40)
+    session.update(SceneDelta(added=SCENE.subset(np.arange(40)), added_ids=new, added_groups=np.full(40, 7)))
+    for view in VIEWS[:3]:
+        session.fuse(view)
+    session.save(tmp_path / "early.npz")
+    other = LivingSession(session.living, NAMES)
+    assert other.merge([tmp_path / "early.npz"]) == 3
+    loop = GroupMove(7, Similarity(translation=np.array([0.1, 0.0, 0.05])), ("view0",))
+    for robots in (session, other):
+        robots.update(SceneDelta(removed=np.arange(30), moves=(loop,)))
+    session.fuse(VIEWS[3])
+    session.save(tmp_path / "late.npz")
+    assert other.merge([tmp_path / "late.npz"]) == 1
+    assert other.num_fused == session.num_fused == 4
+    np.testing.assert_array_equal(other._live._votes.dense(), session._live._votes.dense())
+
+
+def test_with_too_little_memory_for_what_comes_nothing_has_changed(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    session, state = load(robot(tmp_path / "a.npz", VIEWS[:2], names=None)), robot(tmp_path / "b.npz", VIEWS[2:])
+    before, names = session._live._votes.dense(), session.class_names
+
+    def fails(*_: object) -> None:
+        raise MemoryError
+
+    with monkeypatch.context() as patched:
+        patched.setattr(VoteTotal, "from_rows", fails)
+        with pytest.raises(MemoryError):
+            session.merge([state])
+    assert session.class_names == names and session.num_fused == session.num_views == 2
     np.testing.assert_array_equal(session._live._votes.dense(), before)
 
 
