@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+import re
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import replace
 from typing import NamedTuple
@@ -16,6 +17,9 @@ from gsseg_core.errors import StateFileError, StateMismatchError
 from gsseg_core.learn.learner_state import OBJECTS_OF_ONE_SESSION, State
 from gsseg_core.scene.group_frames import is_same
 from gsseg_core.scene.living_scene import LivingScene
+
+
+_COUNT = re.compile(r"_[0-9]{1,3}$")  # that merging gave a name; stamps are longer
 
 
 class Saved(NamedTuple):
@@ -120,16 +124,16 @@ def _brings_nothing(one: State, other: State) -> bool:
 
 
 def shared_views(views: Iterable[View], known: Iterable[View]) -> list[str]:
-    """Name the views that are among those known, with the same pose and mask, whatever they are called there.
+    """Name the views that are among those known: with the same pose and mask, under their name or a merged one.
 
     Each that is known stands for one: a camera that stands still has several alike.
     """
     left: dict[tuple[object, ...], list[View]] = {}
     for view in known:
-        left.setdefault(_where_from(view), []).append(view)
+        left.setdefault(_which(view), []).append(view)
     shared = []
     for view in views:
-        alike = left.get(_where_from(view), [])
+        alike = left.get(_which(view), [])
         found = next((other for other in alike if np.array_equal(view.read_labels(), other.read_labels())), None)
         if found is not None:
             alike.remove(found)
@@ -137,6 +141,7 @@ def shared_views(views: Iterable[View], known: Iterable[View]) -> list[str]:
     return shared
 
 
-def _where_from(view: View) -> tuple[object, ...]:
-    """Group, intrinsics and pose of a view, to look it up by."""
-    return view.group, view.camera.K.tobytes(), view.camera.world_to_camera.tobytes()
+def _which(view: View) -> tuple[object, ...]:
+    """What views have in common that may be the same one: the name before merging, group, intrinsics and pose."""
+    name = _COUNT.sub("", view.name)
+    return name, view.group, view.camera.K.tobytes(), view.camera.world_to_camera.tobytes()
