@@ -18,7 +18,6 @@ from gsseg_core.learn.learner_state import OBJECTS_OF_ONE_SESSION, State
 from gsseg_core.scene.group_frames import is_same
 from gsseg_core.scene.living_scene import LivingScene
 
-
 _COUNT = re.compile(r"_[0-9]{1,3}$")  # that merging gave a name; stamps are longer
 
 
@@ -142,6 +141,6 @@ def shared_views(views: Iterable[View], known: Iterable[View]) -> list[str]:
 
 
 def _which(view: View) -> tuple[object, ...]:
-    """What views have in common that may be the same one: the name before merging, group, intrinsics and pose."""
+    """Give what views have in common that may be the same one: name before merging, group, intrinsics and pose."""
     name = _COUNT.sub("", view.name)
     return name, view.group, view.camera.K.tobytes(), view.camera.world_to_camera.tobytes()
