@@ -230,7 +230,7 @@ def halfway(robot: Robot, goal: Goal, stage: str, done: int) -> None:
         ({"dataset_path": "long"}, "observe", 0),
         ({"dataset_path": "long"}, "observe", 100),
         ({"dataset_path": "long", "learner": "votes"}, "observe", 20),
-        ({"dataset_path": "long", "num_views": 1000}, "em", 0),
+        ({"dataset_path": "long", "num_views": 400}, "em", 0),
         ({"learner": "gradient", "max_steps": 1_000_000}, "gradient", 100),
     ],
 )
