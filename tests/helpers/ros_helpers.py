@@ -31,6 +31,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from node_template import Copy, Template
 from patience import PATIENCE, wait_until
 
 from gsseg_ros.child_nodes import NODES, claimed_domain
@@ -84,11 +85,7 @@ class Process:
     def __init__(self, module: str, arguments: list[str], environment: Mapping[str, str]) -> None:
         self._lines: list[str] = []
         self._name = module
-        self._process = subprocess.Popen(
-            [sys.executable, "-m", NODES.get(module, f"gsseg_ros.{module}"), *arguments],
-            cwd=REPOSITORY, env=dict(environment), stdin=subprocess.DEVNULL, stdout=subprocess.PIPE,
-            stderr=subprocess.STDOUT, text=True, errors="replace",
-        )  # fmt: skip
+        self._process = _started(module, arguments, environment)
         self._reader = threading.Thread(target=self._read, daemon=True)
         self._reader.start()
 
@@ -104,6 +101,14 @@ class Process:
     @property
     def running(self) -> bool:
         return self._process.poll() is None
+
+    @property
+    def stopped(self) -> bool:
+        """Whether a signal has stopped all of its threads, or it has ended."""
+        with suppress(OSError):  # Of a thread that has just ended.
+            stats = [path.read_text() for path in Path(f"/proc/{self.pid}/task").glob("*/stat")]
+            return all(stat.rpartition(")")[2].split()[0] in "TZX" for stat in stats)
+        return False
 
     def wait(self, timeout: float = PATIENCE) -> int:
         """Wait for its end and return the exit code; fails the test if it does not end."""
@@ -145,6 +150,23 @@ class Process:
         assert self._process.stdout is not None
         with self._process.stdout as pipe:
             self._lines.extend(pipe)
+
+
+def _started(module: str, arguments: list[str], environment: Mapping[str, str]) -> subprocess.Popen[str] | Copy:
+    """Start a node as a copy, unless its environment is one that what it imports may read, or another program."""
+    if module in NODES and "PYTEST_CURRENT_TEST" in os.environ:
+        if not _templates:
+            _templates.append(Template(environment))
+        if _templates[0].serves(environment):
+            return _templates[0].start(NODES[module], arguments, environment)
+    return subprocess.Popen(
+        [sys.executable, "-m", NODES.get(module, f"gsseg_ros.{module}"), *arguments],
+        cwd=REPOSITORY, env=dict(environment), stdin=subprocess.DEVNULL, stdout=subprocess.PIPE,
+        stderr=subprocess.STDOUT, text=True, errors="replace",
+    )  # fmt: skip
+
+
+_templates: list[Template] = []
 
 
 class Ros:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import contextlib
 import functools
-import os
 import signal
 import threading
 import time
@@ -14,7 +13,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from patience import PATIENCE
+from patience import PATIENCE, wait_until
 from ros_fixtures import node_fixture, parameters_fixture, root_fixture  # noqa: F401
 from ros_helpers import Ros, ros_fixture  # noqa: F401
 from ros_robot import Goal, Robot, core_session, renamed
@@ -129,7 +128,7 @@ class Saving:
         if not self._grown():
             return False
         process.send(signal.SIGSTOP)
-        os.waitid(os.P_PID, process.pid, os.WSTOPPED | os.WEXITED | os.WNOWAIT)
+        wait_until(lambda: process.stopped, "all threads to stop")
         if not self._grown():
             process.send(signal.SIGCONT)
             return False
