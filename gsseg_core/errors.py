@@ -121,5 +121,11 @@ class NoCodesError(GssegError):
 
 
 def memory_ran_out(error: BaseException) -> bool:
-    """Tell whether an error says that memory is not enough, that of a GPU too: PyTorch's, which may not be loaded."""
-    return isinstance(error, MemoryError) or type(error).__name__ == "OutOfMemoryError"
+    """Tell whether an error says that memory is not enough: for an array, a thread, a library, or on a GPU.
+
+    PyTorch has its own error for the last one; it may not be loaded.
+    """
+    if isinstance(error, MemoryError) or type(error).__name__ == "OutOfMemoryError":
+        return True
+    no_thread = isinstance(error, RuntimeError) and "can't start new thread" in str(error)
+    return no_thread or (isinstance(error, ImportError) and "failed to map segment" in str(error))

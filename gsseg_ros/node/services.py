@@ -18,7 +18,7 @@ from rclpy.lifecycle import LifecycleNode
 from sensor_msgs.msg import Image
 from std_msgs.msg import Header
 
-from gsseg_core.errors import GssegError
+from gsseg_core.errors import GssegError, memory_ran_out
 from gsseg_core.export.class_files import mesh_file_name, write_classes
 from gsseg_core.export.collision import check_collision, collision_meshes
 from gsseg_core.export.summary import RunReport
@@ -90,14 +90,19 @@ def explain(node: LifecycleNode, error: Exception) -> str:
         node.get_logger().warning(str(error))
         return str(error)
     node.get_logger().error(describe(error))
-    return one_line(f"unexpected {type(error).__name__}: {error}; the node's log has the details")
+    return one_line(f"{_unforeseen(error)}; the node's log has the details")
 
 
 def describe(error: Exception) -> str:
     """Describe an error in one line if it was foreseen, with its traceback if not."""
     if isinstance(error, GssegError):
         return str(error)
-    return one_line(f"unexpected {type(error).__name__}: {error}") + f"\n{traceback.format_exc()}"
+    return one_line(_unforeseen(error)) + f"\n{traceback.format_exc()}"
+
+
+def _unforeseen(error: Exception) -> str:
+    """Name what went wrong; where memory is short, a thread or a library that found none says so in its own words."""
+    return f"unexpected {'MemoryError' if memory_ran_out(error) else type(error).__name__}: {error}"
 
 
 class Services:
