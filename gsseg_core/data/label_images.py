@@ -147,3 +147,7 @@ class PackedLabels:
     def unpack(self) -> npt.NDArray[np.int32]:
         """Return the labels, (H, W) int32, in memory of their own."""
         return np.frombuffer(zlib.decompress(self._data), self._dtype).reshape(self._shape).astype(np.int32)
+
+    def is_same(self, other: PackedLabels) -> bool:
+        """Whether the labels of another image are the same; none are unpacked, as the same ones are packed alike."""
+        return (self._shape, self._dtype, self._data) == (other._shape, other._dtype, other._data)

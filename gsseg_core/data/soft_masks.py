@@ -141,6 +141,13 @@ class PackedMask:
         """Return what was packed; the labels in memory of their own."""
         return SeenLabels(self._labels.unpack(), self._evidence)
 
+    def is_same(self, other: PackedMask) -> bool:
+        """Whether another mask has the same labels, and the same evidence."""
+        one, two = self._evidence, other._evidence
+        if one is None or two is None:
+            return one is two and self._labels.is_same(other._labels)
+        return self._labels.is_same(other._labels) and one.is_same(two)
+
 
 def quantise(
     probabilities: npt.NDArray[np.floating],  # (C, H, W) of 16, 32 or 64 bits, in [0, 1]; [c] is of class classes[c]

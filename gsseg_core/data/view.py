@@ -58,6 +58,8 @@ class View:
     group : int or None
         The group of Gaussians that the camera moves with, and in whose frame its pose is, see docs/living_map.md; None
         if it stays where it is in the scene.
+    former_name : str or None
+        The name that it had before states were merged, where that gave it another one.
     """
 
     camera: Camera
@@ -70,6 +72,7 @@ class View:
     foreign_mask: ViewMask | None = field(default=None, repr=False)
     label_map: LabelMap | None = field(default=None, repr=False)
     group: int | None = None
+    former_name: str | None = None
     _mask: PackedMask | None = field(default=None, repr=False)
 
     @classmethod
@@ -211,6 +214,10 @@ class View:
     def source(self) -> str:
         """What messages call the mask: its file, or the view."""
         return self.foreign_mask.where if self.foreign_mask else str(self.mask_path or f"view '{self.name}'")
+
+    def has_same_mask(self, other: View) -> bool:
+        """Whether another view has the same labels and evidence in each pixel; both masks are in memory."""
+        return self._mask is not None and other._mask is not None and self._mask.is_same(other._mask)
 
     @property
     def mask_bits(self) -> int | None:

@@ -208,7 +208,8 @@ class State:
 
 def _entry(view: View) -> dict[str, Any]:
     entry: dict[str, Any] = {"name": view.name, "size": [view.camera.width, view.camera.height]}
-    return entry if view.group is None else {**entry, "group": view.group}
+    also = {"group": view.group, "former_name": view.former_name}
+    return entry | {name: value for name, value in also.items() if value is not None}
 
 
 def _read_votes(file: NpzArrays, shape: tuple[int, int], num_kept: int, num_fused: int) -> CSRRows:
@@ -271,6 +272,8 @@ def _read_view(file: NpzArrays, i: int, entry: dict[str, Any], num_classes: int)
             view = View.from_arrays(camera, labels)
         if "group" in entry:
             view = replace(view, group=whole_number(entry["group"], "group of a view", 0, MAX_ID))
+        if "former_name" in entry:
+            view = replace(view, former_name=str(entry["former_name"]))
     except GssegError as error:
         raise UnfitError(str(error)) from error
     if view.largest_label >= num_classes:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import itertools
-import re
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import replace
 from typing import NamedTuple
@@ -18,8 +17,6 @@ from gsseg_core.learn.learner_state import OBJECTS_OF_ONE_SESSION, State
 from gsseg_core.scene.group_frames import is_same
 from gsseg_core.scene.living_scene import LivingScene
 
-_COUNT = re.compile(r"_[0-9]{1,3}$")  # that merging gave a name; stamps are longer
-
 
 class Saved(NamedTuple):
     """A state, and what errors call it."""
@@ -29,7 +26,7 @@ class Saved(NamedTuple):
     state: State
 
 
-def merge_states(saved: Sequence[Saved], without: Callable[[State, list[str]], State] | None = None) -> State:
+def merge_states(saved: Sequence[Saved], without: Callable[[State, tuple[str, ...]], State] | None = None) -> State:
     """Add up states of one scene, at least one: votes exactly, views one after the other, class names together.
 
     Views of the same name are told apart: the later one is called like "view_2". Codes that were learnt are those of
@@ -80,12 +77,12 @@ def merge_states(saved: Sequence[Saved], without: Callable[[State, list[str]], S
                     f"{one.source}: {other.source} has all its votes and views already, which would count twice; "
                     "expected each state once"
                 )
-        shared = shared_views(one.state.views, views.values()) if without else []
+        shared = shared_views(one.state.views, views.values()) if without else ()
         state = without(one.state, shared) if without and shared else one.state
         votes, num_fused = votes.plus(state.votes), num_fused + state.num_fused
         for view in state.views:
             name = next(free for free in _names(view.name) if free not in views)
-            views[name] = view if name == view.name else replace(view, camera=replace(view.camera, name=name))
+            views[name] = view if name == view.name else _renamed(view, name)
     num_classes = max(one.state.num_classes for one in saved)
     # One state alone stays of its kind.
     return replace(
@@ -98,6 +95,15 @@ def _names(name: str) -> Iterator[str]:
     """Give the names that views of one name get, one after the other."""
     yield name
     yield from (f"{name}_{count}" for count in itertools.count(2))
+
+
+def _renamed(view: View, name: str) -> View:
+    """Give a view another name; it keeps the one that its robot knows it by."""
+    return replace(view, camera=replace(view.camera, name=name), former_name=_first_name(view))
+
+
+def _first_name(view: View) -> str:
+    return view.name if view.former_name is None else view.former_name
 
 
 def _is_same_map(one: LivingScene | None, other: LivingScene | None) -> bool:
@@ -122,8 +128,8 @@ def _brings_nothing(one: State, other: State) -> bool:
     return len(shared_views(one.views, other.views)) == len(one.views)
 
 
-def shared_views(views: Iterable[View], known: Iterable[View]) -> list[str]:
-    """Name the views that are among those known: with the same pose and mask, under their name or a merged one.
+def shared_views(views: Iterable[View], known: Iterable[View]) -> tuple[str, ...]:
+    """Name the views that are among those known: with the same pose, mask, and name before they were merged.
 
     Each that is known stands for one: a camera that stands still has several alike.
     """
@@ -133,14 +139,13 @@ def shared_views(views: Iterable[View], known: Iterable[View]) -> list[str]:
     shared = []
     for view in views:
         alike = left.get(_which(view), [])
-        found = next((other for other in alike if np.array_equal(view.read_labels(), other.read_labels())), None)
+        found = next((other for other in alike if view.has_same_mask(other)), None)
         if found is not None:
             alike.remove(found)
             shared.append(view.name)
-    return shared
+    return tuple(shared)
 
 
 def _which(view: View) -> tuple[object, ...]:
     """Give what views have in common that may be the same one: name before merging, group, intrinsics and pose."""
-    name = _COUNT.sub("", view.name)
-    return name, view.group, view.camera.K.tobytes(), view.camera.world_to_camera.tobytes()
+    return _first_name(view), view.group, view.camera.K.tobytes(), view.camera.world_to_camera.tobytes()

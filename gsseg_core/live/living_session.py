@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import os
 from collections.abc import Callable, Mapping, Sequence
+from copy import copy
 from dataclasses import dataclass, field, replace
+from functools import cache
 from pathlib import Path
 from typing import Any
 from weakref import WeakKeyDictionary
@@ -15,7 +17,7 @@ from gsseg_core.data.view import View
 from gsseg_core.errors import StateMismatchError
 from gsseg_core.learn.learner_state import Learnt, State
 from gsseg_core.learn.merged_states import Saved, merge_states
-from gsseg_core.live.living_votes import LivingVotes, carried_over
+from gsseg_core.live.living_votes import LivingVotes, carried_over, without_views
 from gsseg_core.live.matching_scenes import Matching, match_scenes, places_in_saved
 from gsseg_core.live.scene_change import SceneChange, carried
 from gsseg_core.live.session import LiveSession
@@ -185,14 +187,14 @@ class LivingSession(LiveSession):
             It lies outside the folder `within`, links followed.
         """
         with self._lock:
-            digest, now = self.scene.digest, self._live.state()
-            now = replace(now, num_fused=self.num_fused, class_names=self._classes.names, living=None)
-            saved = [Saved("what is known here", digest, now)]
-            for path in paths:
-                state = self._read_state(Path(path), within)
-                self._check_classes(path, state)
-                saved.append(Saved(str(path), digest, replace(state, living=None)))
-            merged = merge_states(saved, self._without)
+            still, known = copy(self), self._known()  # From here on the scene may change, and views come.
+        saved = [still._read_saved(path, within) for path in paths]
+        without = cache(lambda state, names: without_views(state, names, still.living, still.device))
+        merge_states([known, *saved], without)  # Views are taken out, which takes long, while none waits to be fused.
+        with self._lock:
+            if self._living is not still.living:
+                return self.merge(paths, within)  # Now that it cannot change again.
+            merged = merge_states([self._known(), *saved], without)
             self._live.adopt(merged)  # First: with too little memory for it, nothing has changed.
             self._classes.reset(merged.class_names)
             came, self.num_fused = merged.num_fused - self.num_fused, merged.num_fused
@@ -200,14 +202,14 @@ class LivingSession(LiveSession):
             self._drop_old_views()
         return came
 
-    def _without(self, state: State, names: list[str]) -> State:
-        """Take views and their votes out of a state."""
-        votes = self._no_votes(state.num_classes)
-        votes.adopt(state)
-        for name in names:
-            votes.retract(name)
-        left = votes.state()
-        return replace(state, votes=left.votes, views=left.views, num_fused=state.num_fused - len(names))
+    def _known(self) -> Saved:
+        state = replace(self._live.state(), num_fused=self.num_fused, class_names=self._classes.names, living=None)
+        return Saved("what is known here", self.scene.digest, state)
+
+    def _read_saved(self, path: str | os.PathLike[str], within: Path | None) -> Saved:
+        state = self._read_state(Path(path), within)
+        self._check_classes(path, state)
+        return Saved(str(path), self.scene.digest, replace(state, living=None))
 
     def _no_votes(self, num_classes: int) -> LivingVotes:
         return LivingVotes(self._living, num_classes, device=self.device)

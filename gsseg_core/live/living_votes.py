@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Collection, Mapping
 from dataclasses import replace
 from weakref import WeakKeyDictionary
 
@@ -161,6 +161,19 @@ def carried_over(state: State, change: SceneChange, joining: Mapping[str, int | 
     votes.change(change, joining)
     now, learnt = votes.state(), state.learnt and state.learnt.carried(change.carry)
     return replace(state, votes=now.votes, views=now.views, living=now.living, learnt=learnt, whole_rays=False)
+
+
+def without_views(state: State, names: Collection[str], living: LivingScene, device: str) -> State:
+    """Take views and their votes out of a state, whose scene is this."""
+    views, gone = {view.name: view for view in state.views}, set(names)
+    left = {name: view for name, view in views.items() if name not in gone}
+    votes = LivingVotes(living, state.num_classes, device=device)
+    if state.num_fused == len(views) and len(left) < len(gone):
+        votes._lift_all(left, [*left], 1)  # There are no other votes, and these take less time to lift.
+    else:
+        votes.adopt(state)
+        votes._lift_all(views, [*names], -1)
+    return replace(state, votes=votes._votes.rows(), views=[*left.values()], num_fused=state.num_fused - len(gone))
 
 
 def without_groups(state: State, device: str) -> State:

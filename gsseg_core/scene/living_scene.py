@@ -7,6 +7,7 @@ the group goes. See docs/living_map.md.
 
 from __future__ import annotations
 
+import threading
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from functools import cached_property
@@ -52,6 +53,7 @@ class LivingScene:
     frames: Mapping[int, Similarity]
     revision: int | None = None
     _seen: dict[int, GaussianScene] = field(default_factory=dict, repr=False)
+    _seeing: threading.Lock = field(default_factory=threading.Lock, repr=False)
 
     @classmethod
     def of(cls, scene: GaussianScene) -> LivingScene:
@@ -103,11 +105,12 @@ class LivingScene:
             return self.scene
         if all(relation(self.frames[group], frame) is IDENTITY for frame in self.frames.values()):
             return self.local
-        if group not in self._seen:
-            while len(self._seen) >= _FRAMES_KEPT:
-                del self._seen[next(iter(self._seen))]
-            self._seen[group] = self._in_frame(group, np.arange(len(self)))
-        return self._seen[group]
+        with self._seeing:
+            if group not in self._seen:
+                while len(self._seen) >= _FRAMES_KEPT:
+                    del self._seen[next(iter(self._seen))]
+                self._seen[group] = self._in_frame(group, np.arange(len(self)))
+            return self._seen[group]
 
     def part_seen_from(self, group: int | None, places: npt.NDArray[np.int64]) -> GaussianScene:  # (M,), M > 0
         """Pick some of the Gaussians of `seen_from`, bit for bit; positions and shapes only."""

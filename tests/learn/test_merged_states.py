@@ -2,18 +2,25 @@
 
 from __future__ import annotations
 
+import threading
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 from small_scenes import NAMES, balls_on_a_table, clean_views
 
 from gsseg_core.cli.main import main
+from gsseg_core.data.soft_masks import SeenLabels
 from gsseg_core.data.view import View
 from gsseg_core.errors import StateFileError
+from gsseg_core.learn.learner_state import State
+from gsseg_core.live import living_session
 from gsseg_core.live.living_session import LivingSession
+from gsseg_core.live.living_votes import LivingVotes, without_views
 from gsseg_core.live.per_view_session import PerViewSession
+from gsseg_core.raster.view_operator import ViewOperator
 from gsseg_core.raster.vote_total import VoteTotal
 from gsseg_core.scene.gaussian_scene import GaussianScene
 from gsseg_core.scene.scene_delta import GroupMove, SceneDelta
@@ -152,6 +159,104 @@ def test_a_camera_that_stands_still_has_as_many_views_as_it_sent(tmp_path: Path)
     session = load(robot(tmp_path / "own.npz", [*VIEWS[4:], *still[:2]]))
     assert session.merge([robot(tmp_path / "other.npz", still)]) == 1
     whole = load(robot(tmp_path / "all.npz", [*VIEWS[4:], *still]))
+    np.testing.assert_array_equal(session._live._votes.dense(), whole._live._votes.dense())
+
+
+@pytest.mark.parametrize("soft", [False, True])
+def test_masks_that_name_the_same_classes_and_say_them_otherwise_are_two_views(tmp_path: Path, soft: bool) -> None:
+    camera, labels = VIEWS[0].camera, VIEWS[0].read_labels()
+    unsure = (labels == np.arange(4)[:, None, None]) * np.float32(0.5)
+    if soft:
+        others = [View.from_probabilities(camera, unsure), View.from_probabilities(camera, unsure * 2 - unsure / 2)]
+    else:
+        others = [View.from_arrays(camera, labels), View.from_arrays(camera, labels, supervised=[1, 2, 3])]
+    session = load(robot(tmp_path / "a.npz", [VIEWS[1], others[0]]))
+    assert session.merge([robot(tmp_path / "b.npz", [others[1]])]) == 1
+    again = replace(others[1], camera=replace(camera, name="view0_2"))
+    whole = load(robot(tmp_path / "all.npz", [VIEWS[1], *others[:1], again]))
+    np.testing.assert_array_equal(session._live._votes.dense(), whole._live._votes.dense())
+    assert session.merge([robot(tmp_path / "c.npz", [*others[:1], VIEWS[2]])]) == 1
+
+
+@pytest.mark.parametrize("names", [("frame_001", "frame_002"), ("view_2", "view_3"), ("", "_2"), ("7", "8")])
+def test_a_camera_that_stands_still_and_counts_its_views_has_all_of_them(
+    tmp_path: Path, names: tuple[str, ...]
+) -> None:
+    """Names may end as those do that merging gives."""
+    one, two = (replace(VIEWS[0], camera=replace(VIEWS[0].camera, name=name)) for name in names)
+    session = load(robot(tmp_path / "a.npz", [one]))
+    assert session.merge([robot(tmp_path / "b.npz", [two])]) == 1
+    assert session.merge([robot(tmp_path / "c.npz", [two, one, VIEWS[1]])]) == 1
+    assert session.view_names == [*names, "view1"] and session.num_fused == 3
+
+
+def test_a_view_that_got_another_name_twice_is_known_by_its_first(tmp_path: Path) -> None:
+    elsewhere = [
+        robot(tmp_path / f"{view.name}.npz", [replace(view, camera=replace(view.camera, name="view0"))])
+        for view in VIEWS[3:]
+    ]
+    other = load(robot(tmp_path / "own.npz", [VIEWS[0]]))
+    other.merge(elsewhere[:1])
+    other.save(tmp_path / "two.npz")
+    session = load(robot(tmp_path / "taken.npz", [replace(VIEWS[5], camera=replace(VIEWS[5].camera, name="view0_2"))]))
+    session.merge([tmp_path / "two.npz"])
+    assert [(view.name, view.former_name) for view in session.views] == [
+        ("view0_2", None), ("view0", None), ("view0_2_2", "view0"),
+    ]  # fmt: skip
+    with pytest.raises(StateFileError, match=r"view3\.npz: what is known here has all its votes and views already"):
+        session.merge(elsewhere[:1])
+    assert session.merge(elsewhere[1:]) == 2
+
+
+@pytest.mark.parametrize("kept", [1, 200])
+def test_where_most_of_a_state_is_known_only_what_is_new_is_lifted_if_its_votes_are_all_of_views_that_it_keeps(
+    tmp_path: Path, kept: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    late = LivingSession(SCENE, NAMES, max_views=kept)
+    if kept == 1:
+        late.fuse(VIEWS[5])
+    states = []
+    for view in VIEWS[:4]:
+        late.fuse(view)
+        late.save(tmp_path / f"{view.name}.npz")
+        states.append(tmp_path / f"{view.name}.npz")
+    session, lifted = load(states[2]), list[tuple[str, int]]()
+    lift = LivingVotes._lift
+
+    def counted(
+        votes: LivingVotes, view: View, seen: SeenLabels, sign: int, operator: ViewOperator | None = None
+    ) -> bool:
+        lifted.append((view.name, sign))
+        return lift(votes, view, seen, sign, operator)
+
+    monkeypatch.setattr(LivingVotes, "_lift", counted)
+    session.merge([states[3]])
+    assert lifted == ([] if kept == 1 else [("view3", 1)])
+    if kept == 200:
+        np.testing.assert_array_equal(session._live._votes.dense(), late._live._votes.dense())
+
+
+def test_while_views_are_taken_out_others_are_fused_and_the_scene_may_change(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    session = load(robot(tmp_path / "a.npz", VIEWS[:3]))
+    late = robot(tmp_path / "late.npz", VIEWS[1:5])
+    meanwhile = [lambda: session.update(SceneDelta(removed=np.arange(50))), lambda: session.fuse(VIEWS[5])]
+
+    def taken_out(*given: Any) -> State:
+        while meanwhile:
+            other = threading.Thread(target=meanwhile.pop())
+            other.start()
+            other.join(60)
+            assert not other.is_alive()
+        return without_views(*given)
+
+    monkeypatch.setattr(living_session, "without_views", taken_out)
+    assert session.merge([late]) == 2
+    whole = LivingSession(session.living, NAMES)
+    for view in VIEWS:
+        whole.fuse(view)
+    assert session.num_fused == 6 and not meanwhile
     np.testing.assert_array_equal(session._live._votes.dense(), whole._live._votes.dense())
 
 
