@@ -40,12 +40,14 @@ class GradientSettings:
 
     def __post_init__(self) -> None:
         """Validate."""
-        counts = isinstance(self.epochs, int | np.integer) and isinstance(self.seed, int | np.integer)
-        if not counts or self.epochs < 1 or self.seed < 0 or not 0 < self.final_rate <= self.rate < np.inf:
+        whole = isinstance(self.epochs, int | np.integer)
+        if not whole or self.epochs < 1 or not 0 < self.final_rate <= self.rate < np.inf:
             raise SettingsError(
-                f"gradient: epochs is {self.epochs}, seed {self.seed}, rate {self.rate}, final_rate {self.final_rate}; "
-                "expected whole numbers from 1 and from 0, and 0 < final_rate <= rate, finite"
+                f"gradient: epochs is {self.epochs}, rate {self.rate}, final_rate {self.final_rate}; "
+                "expected at least one epoch, a whole number, and 0 < final_rate <= rate, finite"
             )
+        if not isinstance(self.seed, int | np.integer) or self.seed < 0:
+            raise SettingsError(f"gradient: seed is {self.seed}; expected a whole number from 0")
 
 
 class GradientLearner(Learner):

@@ -153,8 +153,12 @@ class Process:
 
 
 def _started(module: str, arguments: list[str], environment: Mapping[str, str]) -> subprocess.Popen[str] | Copy:
-    """Start a node as a copy, unless its environment is one that what it imports may read, or another program."""
-    if module in NODES and "PYTEST_CURRENT_TEST" in os.environ:
+    """Start a node as a copy, unless its environment is one that what it imports may read, or another program.
+
+    With more threads than one for its products, NumPy starts them when it is imported, and copies would lack them.
+    """
+    alone = environment.get("OPENBLAS_NUM_THREADS") == "1"
+    if module in NODES and alone and "PYTEST_CURRENT_TEST" in os.environ:
         if not _templates:
             _templates.append(Template(environment))
         if _templates[0].serves(environment):
