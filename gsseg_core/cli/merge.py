@@ -26,9 +26,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(options: argparse.Namespace) -> int:
     """Merge, and say what came together."""
+    from collections import Counter
+
     from gsseg_core.files.atomic import check_writable
     from gsseg_core.learn.learner_state import State
-    from gsseg_core.learn.merged_states import Saved, merge_states, shared_views
+    from gsseg_core.learn.merged_states import Saved, digests, merge_states
     from gsseg_core.text import counted
 
     check_writable(options.out)
@@ -40,9 +42,11 @@ def run(options: argparse.Namespace) -> int:
     tell(f"{counted(merged.num_fused, 'view')} of {counted(len(saved), 'state')}, {len(merged.views):,} with masks: "
          f"{options.out}")  # fmt: skip
     twice = 0
-    for number, one in enumerate(saved):
-        before = [view for other in saved[:number] for view in other.state.views]
-        twice += len(shared_views(one.state.views, before))
+    before = Counter[bytes]()
+    for one in saved:
+        known = Counter(digests(one.state))
+        twice += (known & before).total()
+        before += known
     if twice:
         counts = "count" if twice > 1 else "counts"
         tell(f"{counted(twice, 'view')} {counts} twice: of states that one robot has saved, merge the last alone")

@@ -17,7 +17,7 @@ rest is a vote for no class, but counts against those that were looked for and n
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
@@ -70,13 +70,6 @@ class LabelEvidence:
         """Make these labels of a mask that `is_certain` nameless; `named` still tells their class."""
         mass = np.eye(len(self.classes), dtype=np.float32) if self.mass is None else self.mass
         return LabelEvidence(self.classes, mass, nameless=labels)
-
-    def is_same(self, other: LabelEvidence) -> bool:
-        """Whether the labels of another mask say the same, number for number."""
-        pairs = ((getattr(self, part.name), getattr(other, part.name)) for part in fields(self))
-        return all(
-            one is two or (one is not None and two is not None and np.array_equal(one, two)) for one, two in pairs
-        )
 
     @cached_property
     def former_words(self) -> np.ndarray:

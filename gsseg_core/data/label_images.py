@@ -6,6 +6,7 @@ encoding, 255 or 65535, stands for unknown.
 
 from __future__ import annotations
 
+import hashlib
 import os
 import struct
 import zlib
@@ -22,6 +23,8 @@ from gsseg_core.files.atomic import write_atomically
 from gsseg_core.files.input_files import check_pixels, open_image, open_input, reason
 
 UNKNOWN = -1
+
+DIGEST_BYTES = 16  # of a mask, or a view: no two of a fleet will ever share them by chance
 
 GLOBAL = "global"
 PER_VIEW = "per-view"
@@ -136,18 +139,26 @@ def run_text(run: str | None) -> PngInfo:
     return text
 
 
+def digest_of(*content: object) -> bytes:
+    """Return 16 bytes that are others for other content: bytes, or what has a `repr` of its own."""
+    digest = hashlib.blake2b(digest_size=DIGEST_BYTES)
+    for part in content:
+        packed = part if isinstance(part, bytes) else repr(part).encode(errors="surrogatepass")
+        digest.update(b"%d:" % len(packed))
+        digest.update(packed)
+    return digest.digest()
+
+
 class PackedLabels:
     """A label image (H, W) of `UNKNOWN` to `MAX_LABEL` in memory: a few bytes per outline and next to none per area."""
 
     def __init__(self, labels: npt.NDArray[np.integer[Any]]) -> None:
         largest = int(labels.max()) if labels.size else UNKNOWN
         self._shape, self._dtype = labels.shape, np.min_scalar_type(-largest - 2)
-        self._data = zlib.compress(labels.astype(self._dtype).tobytes(), level=1)
+        packed = labels.astype(self._dtype).tobytes()
+        self._data = zlib.compress(packed, level=1)
+        self.digest = digest_of(self._shape, packed)
 
     def unpack(self) -> npt.NDArray[np.int32]:
         """Return the labels, (H, W) int32, in memory of their own."""
         return np.frombuffer(zlib.decompress(self._data), self._dtype).reshape(self._shape).astype(np.int32)
-
-    def is_same(self, other: PackedLabels) -> bool:
-        """Whether the labels of another image are the same; none are unpacked, as the same ones are packed alike."""
-        return (self._shape, self._dtype, self._data) == (other._shape, other._dtype, other._data)

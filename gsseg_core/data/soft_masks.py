@@ -15,7 +15,7 @@ import numpy.typing as npt
 
 from gsseg_core.data.class_names import listed
 from gsseg_core.data.label_evidence import LabelEvidence
-from gsseg_core.data.label_images import UNKNOWN, PackedLabels
+from gsseg_core.data.label_images import UNKNOWN, PackedLabels, digest_of
 from gsseg_core.errors import MaskFormatError, MaskSizeError, UnknownLabelError
 from gsseg_core.files.limits import MAX_LABEL
 from gsseg_core.files.npz_files import Header
@@ -141,12 +141,14 @@ class PackedMask:
         """Return what was packed; the labels in memory of their own."""
         return SeenLabels(self._labels.unpack(), self._evidence)
 
-    def is_same(self, other: PackedMask) -> bool:
-        """Whether another mask has the same labels, and the same evidence."""
-        one, two = self._evidence, other._evidence
-        if one is None or two is None:
-            return one is two and self._labels.is_same(other._labels)
-        return self._labels.is_same(other._labels) and one.is_same(two)
+    @property
+    def digest(self) -> bytes:
+        """16 bytes that are others for other labels, or other evidence."""
+        given = self._evidence
+        if given is None or given.mass is None:
+            return self._labels.digest
+        said = (None if part is None else part.tobytes() for part in (given.classes, given.mass, given.supervised))
+        return digest_of(self._labels.digest, *said)
 
 
 def quantise(

@@ -11,7 +11,7 @@ import numpy as np
 import numpy.typing as npt
 
 from gsseg_core.data.class_names import listed
-from gsseg_core.data.label_images import UNKNOWN, mask_header
+from gsseg_core.data.label_images import UNKNOWN, digest_of, mask_header
 from gsseg_core.data.label_map import LabelMap
 from gsseg_core.data.mask_files import read_soft_mask
 from gsseg_core.data.mask_formats.images import read_label_image
@@ -215,9 +215,18 @@ class View:
         """What messages call the mask: its file, or the view."""
         return self.foreign_mask.where if self.foreign_mask else str(self.mask_path or f"view '{self.name}'")
 
-    def has_same_mask(self, other: View) -> bool:
-        """Whether another view has the same labels and evidence in each pixel; both masks are in memory."""
-        return self._mask is not None and other._mask is not None and self._mask.is_same(other._mask)
+    @property
+    def first_name(self) -> str:
+        """Name that it had before any states were merged."""
+        return self.name if self.former_name is None else self.former_name
+
+    @property
+    def digest(self) -> bytes:
+        """16 bytes that are others for another first name, group, intrinsics, pose or mask, with all that it says."""
+        packed, camera = PackedMask(self.read_seen()) if self._mask is None else self._mask, self.camera
+        group = None if self.group is None else int(self.group)
+        poses = camera.K.tobytes(), camera.world_to_camera.tobytes()
+        return digest_of(str(self.first_name), group, *poses, packed.digest)
 
     @property
     def mask_bits(self) -> int | None:

@@ -20,7 +20,7 @@ import numpy as np
 from gsseg_core.csr_rows import CSRRows, starts
 from gsseg_core.data.class_names import check_same_names
 from gsseg_core.data.label_evidence import LabelEvidence
-from gsseg_core.data.label_images import PER_VIEW, UNKNOWN
+from gsseg_core.data.label_images import DIGEST_BYTES, PER_VIEW, UNKNOWN
 from gsseg_core.data.soft_masks import TOLERANCE, SeenLabels
 from gsseg_core.data.view import View
 from gsseg_core.errors import GssegError, StateFileError
@@ -56,6 +56,7 @@ OBJECTS_OF_ONE_SESSION = "holds objects that its own session found and numbered 
 """What errors say of a state with `per_view`, where classes are expected that mean the same to others."""
 
 _MOST_VIEWS = 2**31 - 1
+_MOST_DROPPED = 1 << 20  # that are listed: in memory, each takes some 60 bytes
 _MOST_VOTES = 2.0**62
 _VIEW_VOTES = 2.0**24 * LIMITS.max_pixels  # votes of one view for one Gaussian, at most, in units of `VOTE_UNIT`
 
@@ -89,6 +90,12 @@ class State:
     living: LivingScene | None = None  # the scene, if it changes and so is in the file
     per_view: bool = False  # whether its classes are objects that its session found and numbered itself
     whole_rays: bool = False  # whether a version has cast the votes whose rays went on behind surfaces
+    dropped: tuple[bytes, ...] = ()  # `View.digest` of those that are in the votes and no longer kept, as far as known
+
+    @property
+    def all_known(self) -> bool:
+        """Whether all views in the votes are kept or among the `dropped`; an older version did not list these."""
+        return self.num_fused == len(self.views) + len(self.dropped)
 
     def check_names(self, known: Mapping[int, str], source: str | os.PathLike[str], where: str) -> None:
         """Raise `StateFileError` if this state, of `source`, calls a class otherwise than it is called elsewhere."""
@@ -127,6 +134,9 @@ class State:
         if self.living is not None:
             header["frames"] = living_files.frame_entries(self.living)
             arrays |= living_files.arrays(self.living)
+        if self.dropped:
+            digests = b"".join(self.dropped[-_MOST_DROPPED:])
+            arrays["dropped"] = np.frombuffer(digests, np.uint8).reshape(-1, DIGEST_BYTES)
         for i, view in enumerate(self.views):
             arrays[f"labels_{i}"], evidence = view.read_seen()
             if evidence is not None and evidence.mass is not None:
@@ -203,7 +213,8 @@ class State:
             learnt = Learnt(str(entry["learner"]), codes, num_views, temperature_of(entry), _read_evidence(file, n))
         names, per_view = class_names_of(header), header.get("ids") == PER_VIEW
         whole = header["format"] == WHOLE_RAYS or header.get("whole_rays") is True
-        return cls(votes, k, views, num_fused, names, learnt, living, per_view, whole)
+        dropped = _read_dropped(file, min(num_fused - len(views), _MOST_DROPPED))
+        return cls(votes, k, views, num_fused, names, learnt, living, per_view, whole, dropped)
 
 
 def _entry(view: View) -> dict[str, Any]:
@@ -258,6 +269,14 @@ def _read_evidence(file: NpzArrays, num_gaussians: int) -> np.ndarray | None:
     evidence = file.expect("evidence", np.float32, (num_gaussians,))
     check_evidence(evidence)
     return evidence
+
+
+def _read_dropped(file: NpzArrays, most: int) -> tuple[bytes, ...]:
+    if "dropped" not in file.names:
+        return ()
+    if len(dropped := file.expect("dropped", np.uint8, (None, DIGEST_BYTES))) > most:
+        raise UnfitError(f"array dropped is of {len(dropped)} views; expected at most {most}")
+    return tuple(row.tobytes() for row in dropped)
 
 
 def _read_view(file: NpzArrays, i: int, entry: dict[str, Any], num_classes: int) -> View:

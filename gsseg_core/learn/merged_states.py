@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import itertools
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections import Counter
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 from typing import NamedTuple
 
@@ -26,7 +27,9 @@ class Saved(NamedTuple):
     state: State
 
 
-def merge_states(saved: Sequence[Saved], without: Callable[[State, tuple[str, ...]], State] | None = None) -> State:
+def merge_states(
+    saved: Sequence[Saved], without: Callable[[State, tuple[str, ...], bool], State] | None = None
+) -> State:
     """Add up states of one scene, at least one: votes exactly, views one after the other, class names together.
 
     Views of the same name are told apart: the later one is called like "view_2". Codes that were learnt are those of
@@ -37,8 +40,9 @@ def merge_states(saved: Sequence[Saved], without: Callable[[State, tuple[str, ..
     saved : sequence of Saved
         In the order in which they are added.
     without : callable, optional
-        Takes views, by name, and their votes out of a state. With it, a view that several states keep counts once;
-        otherwise as often as they keep it, as without the scene nobody knows its votes.
+        Takes views, by name, and their votes out of a state, and with True all those that it no longer keeps. With it,
+        a view that several states keep counts once; otherwise as often as they keep it, as without the scene nobody
+        knows its votes. Views that a state no longer keeps count once if those before it know all of them, or none.
 
     Raises
     ------
@@ -52,6 +56,7 @@ def merge_states(saved: Sequence[Saved], without: Callable[[State, tuple[str, ..
     first = saved[0]
     names: dict[int, str] = {}
     views: dict[str, View] = {}
+    dropped: tuple[bytes, ...] = ()
     votes, num_fused = CSRRows.empty(first.state.votes.num_rows, np.int64), 0
     for number, one in enumerate(saved):
         if one.scene != first.scene or not _is_same_map(one.state.living, first.state.living):
@@ -77,9 +82,12 @@ def merge_states(saved: Sequence[Saved], without: Callable[[State, tuple[str, ..
                     f"{one.source}: {other.source} has all its votes and views already, which would count twice; "
                     "expected each state once"
                 )
-        shared = shared_views(one.state.views, views.values()) if without else ()
-        state = without(one.state, shared) if without and shared else one.state
+        state = one.state
+        if without and number:
+            shared, old = shared_views(state, Counter([*(view.digest for view in views.values()), *dropped]))
+            state = without(state, shared, old) if shared or old else state
         votes, num_fused = votes.plus(state.votes), num_fused + state.num_fused
+        dropped += state.dropped
         for view in state.views:
             name = next(free for free in _names(view.name) if free not in views)
             views[name] = view if name == view.name else _renamed(view, name)
@@ -87,7 +95,7 @@ def merge_states(saved: Sequence[Saved], without: Callable[[State, tuple[str, ..
     # One state alone stays of its kind.
     return replace(
         first.state, votes=votes.nonzero(), num_classes=num_classes, views=[*views.values()], num_fused=num_fused,
-        class_names=dict(sorted(names.items())), learnt=None,
+        class_names=dict(sorted(names.items())), learnt=None, dropped=dropped,
     )  # fmt: skip
 
 
@@ -99,11 +107,7 @@ def _names(name: str) -> Iterator[str]:
 
 def _renamed(view: View, name: str) -> View:
     """Give a view another name; it keeps the one that its robot knows it by."""
-    return replace(view, camera=replace(view.camera, name=name), former_name=_first_name(view))
-
-
-def _first_name(view: View) -> str:
-    return view.name if view.former_name is None else view.former_name
+    return replace(view, camera=replace(view.camera, name=name), former_name=view.first_name)
 
 
 def _is_same_map(one: LivingScene | None, other: LivingScene | None) -> bool:
@@ -125,27 +129,23 @@ def _brings_nothing(one: State, other: State) -> bool:
     if not one.views:
         alike = one.num_fused == other.num_fused and one.num_classes == other.num_classes
         return alike and all(map(np.array_equal, one.votes, other.votes))
-    return len(shared_views(one.views, other.views)) == len(one.views)
+    shared, old = shared_views(one, Counter(digests(other)))
+    return len(shared) == len(one.views) and (old or not one.dropped or not one.all_known)
 
 
-def shared_views(views: Iterable[View], known: Iterable[View]) -> tuple[str, ...]:
-    """Name the views that are among those known: with the same pose, mask, and name before they were merged.
+def digests(state: State) -> list[bytes]:
+    """List the views in the votes of a state, as far as it knows them."""
+    return [*(view.digest for view in state.views), *state.dropped]
+
+
+def shared_views(state: State, known: Counter[bytes]) -> tuple[tuple[str, ...], bool]:
+    """Name the views of a state that are among those known, and tell whether there are others, all known, too.
 
     Each that is known stands for one: a camera that stands still has several alike.
     """
-    left: dict[tuple[object, ...], list[View]] = {}
-    for view in known:
-        left.setdefault(_which(view), []).append(view)
-    shared = []
-    for view in views:
-        alike = left.get(_which(view), [])
-        found = next((other for other in alike if view.has_same_mask(other)), None)
-        if found is not None:
-            alike.remove(found)
+    left, shared = known.copy(), []
+    for view in state.views:
+        if left[view.digest]:
+            left[view.digest] -= 1
             shared.append(view.name)
-    return tuple(shared)
-
-
-def _which(view: View) -> tuple[object, ...]:
-    """Give what views have in common that may be the same one: name before merging, group, intrinsics and pose."""
-    return _first_name(view), view.group, view.camera.K.tobytes(), view.camera.world_to_camera.tobytes()
+    return tuple(shared), bool(state.dropped) and state.all_known and Counter(state.dropped) <= left

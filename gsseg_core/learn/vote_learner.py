@@ -8,6 +8,7 @@ import numpy as np
 
 from gsseg_core.data.view import View
 from gsseg_core.learn.learner import Learner, Progress, silent
+from gsseg_core.learn.learner_state import State
 from gsseg_core.learn.usable_views import read_mask
 from gsseg_core.raster.view_operator import ViewOperator
 from gsseg_core.scene.camera import Camera
@@ -20,6 +21,16 @@ class VoteLearner(Learner):
     """
 
     leaves_out = True
+    dropped: tuple[bytes, ...] = ()  # `View.digest` of views whose votes stay; replaced and never changed
+
+    def state(self) -> State:
+        """Return a copy of votes and views, to be saved."""
+        return replace(super().state(), dropped=self.dropped)
+
+    def adopt(self, state: State) -> None:
+        """Replace all that is known by a state's, as `Learner.adopt` does."""
+        super().adopt(state)
+        self.dropped = state.dropped
 
     def fit(self, progress: Progress = silent) -> VoteLearner:
         """Normalise the votes."""
@@ -46,8 +57,10 @@ class VoteLearner(Learner):
 
     def keep_last(self, count: int) -> None:
         """Drop the oldest views and their masks, all but so many, of at least one; their votes stay."""
-        for name in list(self.views)[:-count]:
-            self.forget(name)
+        old = list(self.views.values())[:-count]
+        self.dropped += tuple(view.digest for view in old)
+        for view in old:
+            self.forget(view.name)
 
     def _exchange(self, before: View, after: View, operator: ViewOperator | None = None) -> None:
         """Put a view in the place of one of its name, seen by the same operator if one is given."""

@@ -189,7 +189,7 @@ class LivingSession(LiveSession):
         with self._lock:
             still, known = copy(self), self._known()  # From here on the scene may change, and views come.
         saved = [still._read_saved(path, within) for path in paths]
-        without = cache(lambda state, names: without_views(state, names, still.living, still.device))
+        without = cache(lambda state, *what: without_views(state, *what, living=still.living, device=still.device))
         merge_states([known, *saved], without)  # Views are taken out, which takes long, while none waits to be fused.
         with self._lock:
             if self._living is not still.living:

@@ -163,17 +163,19 @@ def carried_over(state: State, change: SceneChange, joining: Mapping[str, int | 
     return replace(state, votes=now.votes, views=now.views, living=now.living, learnt=learnt, whole_rays=False)
 
 
-def without_views(state: State, names: Collection[str], living: LivingScene, device: str) -> State:
-    """Take views and their votes out of a state, whose scene is this."""
+def without_views(state: State, names: Collection[str], dropped: bool, *, living: LivingScene, device: str) -> State:
+    """Take views and their votes out of a state, whose scene is this; and all that are no longer kept, if `dropped`."""
     views, gone = {view.name: view for view in state.views}, set(names)
     left = {name: view for name, view in views.items() if name not in gone}
     votes = LivingVotes(living, state.num_classes, device=device)
-    if state.num_fused == len(views) and len(left) < len(gone):
+    few = state.num_fused == len(views) and len(left) < len(gone)
+    if dropped or few:
         votes._lift_all(left, [*left], 1)  # There are no other votes, and these take less time to lift.
     else:
         votes.adopt(state)
         votes._lift_all(views, [*names], -1)
-    return replace(state, votes=votes._votes.rows(), views=[*left.values()], num_fused=state.num_fused - len(gone))
+    made = replace(state, votes=votes._votes.rows(), views=[*left.values()], num_fused=state.num_fused - len(gone))
+    return replace(made, dropped=(), num_fused=len(left)) if dropped else made
 
 
 def without_groups(state: State, device: str) -> State:

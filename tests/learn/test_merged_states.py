@@ -208,13 +208,12 @@ def test_a_view_that_got_another_name_twice_is_known_by_its_first(tmp_path: Path
     assert session.merge(elsewhere[1:]) == 2
 
 
-@pytest.mark.parametrize("kept", [1, 200])
-def test_where_most_of_a_state_is_known_only_what_is_new_is_lifted_if_its_votes_are_all_of_views_that_it_keeps(
+@pytest.mark.parametrize("kept", [1, 2, 200])
+def test_where_all_but_a_few_views_of_a_state_are_known_only_those_are_lifted(
     tmp_path: Path, kept: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    """Also if the robot has dropped most of them since."""
     late = LivingSession(SCENE, NAMES, max_views=kept)
-    if kept == 1:
-        late.fuse(VIEWS[5])
     states = []
     for view in VIEWS[:4]:
         late.fuse(view)
@@ -231,9 +230,61 @@ def test_where_most_of_a_state_is_known_only_what_is_new_is_lifted_if_its_votes_
 
     monkeypatch.setattr(LivingVotes, "_lift", counted)
     session.merge([states[3]])
-    assert lifted == ([] if kept == 1 else [("view3", 1)])
-    if kept == 200:
-        np.testing.assert_array_equal(session._live._votes.dense(), late._live._votes.dense())
+    assert lifted == [("view3", 1)] and session.num_fused == late.num_fused == 4
+    np.testing.assert_array_equal(session._live._votes.dense(), late._live._votes.dense())
+    with pytest.raises(StateFileError, match="has all its votes and views already"):
+        session.merge([states[3]])
+
+
+def test_where_a_state_does_not_list_what_it_has_dropped_the_views_that_are_known_are_taken_out(tmp_path: Path) -> None:
+    """As an older version did not."""
+    robot_of_old = load(robot(tmp_path / "a.npz", VIEWS[:4]))
+    robot_of_old._live.keep_last(2)
+    robot_of_old._live.dropped = ()
+    robot_of_old.save(tmp_path / "old.npz")
+    session = load(robot(tmp_path / "b.npz", VIEWS[3:5]))
+    assert session.merge([tmp_path / "old.npz"]) == 3
+    whole = load(robot(tmp_path / "all.npz", VIEWS[:5]))
+    np.testing.assert_array_equal(session._live._votes.dense(), whole._live._votes.dense())
+
+
+@pytest.mark.parametrize("count", [1, 2, 3, 6])
+def test_a_session_that_keeps_few_views_counts_each_view_that_comes_again_once(tmp_path: Path, count: int) -> None:
+    session = LivingSession(SCENE, NAMES, max_views=count)
+    for views in (VIEWS[:3], VIEWS[3:5], VIEWS[:4], VIEWS[2:]):
+        try:
+            session.merge([robot(tmp_path / "other.npz", views)])
+        except StateFileError as error:
+            assert views == VIEWS[:4] and "has all its votes and views already" in str(error)
+        session.save(tmp_path / "own.npz")
+        session = LivingSession(SCENE, NAMES, max_views=count)
+        session.load(tmp_path / "own.npz")
+    assert session.num_fused == 6 and session.num_views == count
+    whole = load(robot(tmp_path / "all.npz", VIEWS))
+    np.testing.assert_array_equal(session._live._votes.dense(), whole._live._votes.dense())
+
+
+def test_votes_of_dropped_views_come_with_a_state_whose_other_views_are_known(tmp_path: Path) -> None:
+    other = LivingSession(SCENE, NAMES, max_views=1)
+    for view in VIEWS[:3]:
+        other.fuse(view)
+    other.save(tmp_path / "other.npz")
+    session = load(robot(tmp_path / "own.npz", VIEWS[2:]))
+    assert session.merge([tmp_path / "other.npz"]) == 2
+    whole = load(robot(tmp_path / "all.npz", VIEWS))
+    np.testing.assert_array_equal(session._live._votes.dense(), whole._live._votes.dense())
+
+
+def test_the_command_says_how_many_dropped_views_count_twice(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    early, late = robot(tmp_path / "early.npz", VIEWS[:3]), LivingSession(SCENE, NAMES, max_views=2)
+    for view in VIEWS:
+        late.fuse(view)
+    late.save(tmp_path / "late.npz")
+    assert main(["merge", early, str(tmp_path / "late.npz"), "-o", str(tmp_path / "c.npz")]) == 0
+    assert "3 views count twice" in capsys.readouterr().out
+    assert load(tmp_path / "c.npz").num_fused == 9
 
 
 def test_while_views_are_taken_out_others_are_fused_and_the_scene_may_change(
@@ -243,13 +294,13 @@ def test_while_views_are_taken_out_others_are_fused_and_the_scene_may_change(
     late = robot(tmp_path / "late.npz", VIEWS[1:5])
     meanwhile = [lambda: session.update(SceneDelta(removed=np.arange(50))), lambda: session.fuse(VIEWS[5])]
 
-    def taken_out(*given: Any) -> State:
+    def taken_out(*given: Any, **scene: Any) -> State:
         while meanwhile:
             other = threading.Thread(target=meanwhile.pop())
             other.start()
             other.join(60)
             assert not other.is_alive()
-        return without_views(*given)
+        return without_views(*given, **scene)
 
     monkeypatch.setattr(living_session, "without_views", taken_out)
     assert session.merge([late]) == 2

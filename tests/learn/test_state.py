@@ -137,6 +137,38 @@ def test_a_state_whose_rows_are_broken_is_refused_and_changes_nothing(saved: Pat
         assert_refused(learner, saved, StateFileError)
 
 
+@pytest.mark.parametrize(
+    ("dropped", "message"),
+    [
+        (np.zeros((2, 16), np.uint8), r"array dropped is of 2 views; expected at most 1"),
+        (
+            np.zeros((1, 15), np.uint8),
+            r"array dropped is uint8 of shape \(1, 15\); expected uint8 of shape \(any, 16\)",
+        ),
+        (np.zeros((1, 16), np.int8), "array dropped is int8"),
+    ],
+)
+def test_views_that_are_no_longer_kept_are_listed_and_no_more_of_them_than_there_can_be(
+    tmp_path: Path, dropped: np.ndarray, message: str
+) -> None:
+    session = LiveSession(SCENE, max_views=len(VIEWS) - 1)
+    for view in VIEWS:
+        assert session.fuse(view) is None
+    path = tmp_path / "state.npz"
+    session.save(path)
+    listed = State.load_alone(path)[1]
+    assert listed.dropped == (VIEWS[0].digest,) and listed.all_known
+    again = LiveSession(SCENE)
+    again.load(path)
+    again.save(tmp_path / "again.npz")
+    assert State.load_alone(tmp_path / "again.npz")[1].dropped == listed.dropped
+    with np.load(path) as file:
+        arrays = dict(file)
+    np.savez(path, **{**arrays, "dropped": dropped})
+    with pytest.raises(StateFileError, match=message):
+        State.load_alone(path)
+
+
 def test_a_learner_without_views_can_be_saved_and_restored(tmp_path: Path) -> None:
     save(fresh(), tmp_path / "empty.npz")
     learner = taught(fresh(), VIEWS[:1])
