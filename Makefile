@@ -32,7 +32,7 @@ export CMAKE_BUILD_PARALLEL_LEVEL ?= $(shell nproc 2>/dev/null || echo 1)
 # Beside each other, threads of NumPy's matrix products that wait would take the cores from others, so there is one.
 run-tests run-fast-tests: export OPENBLAS_NUM_THREADS = 1
 
-# Targets that `make test` makes beside the tests.
+# Targets that `make test` makes beside the tests, after lint: tests wait for much, and leave a good part of two cores.
 BESIDE ?=
 
 .PHONY: help demo demo-local view check house environments test lint run-fast-tests run-tests docs colcon results robustness bench clean
@@ -58,8 +58,8 @@ house: $(KERNELS_READY)  ## print what the house measures, with the bar beside e
 	$(BIN)/python benchmarks/house.py $(HOUSE)
 
 test: $(READY)  ## lint, check the types and run the tests
-	@$(MAKE) --no-print-directory --jobs=2 --output-sync=target lint $(KERNELS_READY) $(MSGS_READY)
-	@$(MAKE) --no-print-directory --jobs=2 --output-sync=target --keep-going run-tests $(BESIDE)
+	@$(MAKE) --no-print-directory --jobs=2 --output-sync=target $(KERNELS_READY) $(MSGS_READY)
+	@$(MAKE) --no-print-directory --jobs=2 --output-sync=target --keep-going run-tests lint $(BESIDE)
 
 environments: $(READY) $(COLCON_READY)
 
