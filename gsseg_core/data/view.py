@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Collection, Container, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -220,7 +221,7 @@ class View:
         """Name that it had before any states were merged."""
         return self.name if self.former_name is None else self.former_name
 
-    @property
+    @cached_property
     def digest(self) -> bytes:
         """16 bytes that are others for another first name, group, intrinsics, pose or mask, with all that it says."""
         packed, camera = PackedMask(self.read_seen()) if self._mask is None else self._mask, self.camera

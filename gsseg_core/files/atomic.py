@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import errno
 import fcntl
 import os
 import re
@@ -113,6 +114,8 @@ def _replaceable(path: Path) -> Path:
         mode = os.stat(target).st_mode
     except FileNotFoundError:
         return target
+    except ValueError as error:  # a NUL in the path
+        raise OSError(errno.EINVAL, str(error)) from error
     if not stat.S_ISREG(mode):
         what = "a folder" if stat.S_ISDIR(mode) else "a device, a FIFO or a socket"
         raise PathTakenError(f"{path}: cannot be written (it is {what}); expected a file, or nothing")

@@ -125,11 +125,13 @@ def test_a_temporary_file_of_a_dead_process_is_removed_by_the_next_and_one_of_a_
     assert sorted(path.name for path in tmp_path.iterdir()) == ["b.ply", "c.ply"]
 
 
-@pytest.mark.parametrize("name", ["file/below.json", "x" * 300])
+@pytest.mark.parametrize("name", ["file/below.json", "x" * 300, "nul\0.json"])
 def test_a_path_that_cannot_be_written_is_known_before_the_work(tmp_path: Path, name: str) -> None:
     (tmp_path / "file").write_text("mine")
     with pytest.raises(WriteError, match="cannot be written"):
         check_writable(tmp_path / name)
+    with pytest.raises(WriteError, match="cannot be written"), write_atomically(tmp_path / name):
+        pytest.fail("there is nothing to write to")
     check_writable(tmp_path / "file")
     check_writable(tmp_path / "no" / "such" / "folder" / "yet.json")
     assert [path.name for path in tmp_path.iterdir()] == ["file"]
