@@ -10,6 +10,7 @@ import hashlib
 import os
 import struct
 import zlib
+from functools import cached_property
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -155,10 +156,13 @@ class PackedLabels:
     def __init__(self, labels: npt.NDArray[np.integer[Any]]) -> None:
         largest = int(labels.max()) if labels.size else UNKNOWN
         self._shape, self._dtype = labels.shape, np.min_scalar_type(-largest - 2)
-        packed = labels.astype(self._dtype).tobytes()
-        self._data = zlib.compress(packed, level=1)
-        self.digest = digest_of(self._shape, packed)
+        self._data = zlib.compress(labels.astype(self._dtype).tobytes(), level=1)
 
     def unpack(self) -> npt.NDArray[np.int32]:
         """Return the labels, (H, W) int32, in memory of their own."""
         return np.frombuffer(zlib.decompress(self._data), self._dtype).reshape(self._shape).astype(np.int32)
+
+    @cached_property
+    def digest(self) -> bytes:
+        """16 bytes that are others for other labels."""
+        return digest_of(self._shape, zlib.decompress(self._data))

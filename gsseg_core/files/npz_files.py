@@ -8,6 +8,7 @@ import os
 import sys
 import tokenize
 import zipfile
+import zlib
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, suppress
 from pathlib import Path
@@ -32,6 +33,7 @@ COLDEST = 1e-3
 """Lowest temperature of probabilities; the highest is one over it."""
 
 _SUFFIX = ".npy"
+_LEVEL = 2  # of compression
 _HEADERS = {(1, 0): np.lib.format.read_array_header_1_0, (2, 0): np.lib.format.read_array_header_2_0}
 
 
@@ -266,10 +268,14 @@ def write_npz(path: str | os.PathLike[str], header: dict[str, Any], **arrays: np
 def write_arrays(path: Path, header: dict[str, Any], **arrays: npt.ArrayLike | WithZeros) -> None:
     """Write arrays and a JSON header as one compressed npz, where nothing is."""
     # Two fifths of the time of NumPy's own level, and files 9 % larger.
-    with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED, compresslevel=2) as archive:
+    with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED, compresslevel=_LEVEL) as archive:
         for name, array in {**arrays, "header": np.array(json.dumps(header))}.items():
             with archive.open(f"{name}{_SUFFIX}", "w", force_zip64=True) as file:
                 if isinstance(array, WithZeros):
+                    # Only zeros come again, and who looks for nothing else takes less time and room. zipfile cannot be
+                    # told; where it has no such attribute, all is as for other arrays.
+                    runs = zlib.compressobj(_LEVEL, zlib.DEFLATED, -zlib.MAX_WBITS, strategy=zlib.Z_RLE)
+                    file._compressor = runs  # type: ignore[attr-defined]
                     array.write(file)
                 else:
                     np.lib.format.write_array(file, np.asanyarray(array), allow_pickle=False)

@@ -350,3 +350,13 @@ def test_raw_bytes_and_bombs_in_place_of_a_soft_mask_are_refused(tmp_path: Path)
     assert_refused_in_little_memory(view.read_seen, MaskFormatError, "'probabilities' is none of NumPy's")
     with_bomb(tmp_path / "view0.npz", "probabilities", (4, 2048, 2048))
     assert_refused_in_little_memory(view.read_seen, MaskSizeError, "2048 x 2048 pixels")
+
+
+def test_a_sparse_array_takes_less_room_than_numpy_would_give_it(tmp_path: Path) -> None:
+    rng = np.random.default_rng(0)
+    dense = np.where(rng.random((3_000, 40)) < 0.1, rng.random((3_000, 40)), 0).astype(np.float32)
+    npz_files.write_npz(tmp_path / "ours.npz", {}, shares=npz_files.WithZeros(csr_rows.CSRRows.from_dense(dense), 40))
+    np.savez_compressed(tmp_path / "numpys.npz", shares=dense)
+    np.testing.assert_array_equal(np.load(tmp_path / "ours.npz")["shares"], dense)
+    ours, numpys = (zipfile.ZipFile(tmp_path / name).getinfo("shares.npy") for name in ("ours.npz", "numpys.npz"))
+    assert ours.compress_size < numpys.compress_size and ours.file_size == numpys.file_size
