@@ -101,7 +101,12 @@ def warnings_of(report: Mapping[str, Any], ious: np.ndarray | None) -> list[str]
         )
     names = dict(enumerate(entry["name"] for entry in report["classes"]))
     empty = [entry["name"] for entry in report["classes"] if entry["id"] and not entry["gaussians"]]
-    if empty:
+    if empty and report.get("ids"):
+        warnings.append(
+            f"{len(empty):,} of {counted(report['ids']['objects'], 'object')} that were found got no Gaussian, as "
+            f"other views give what their masks show to others: {_some(empty)}."
+        )
+    elif empty:
         warnings.append(f"{counted(len(empty), 'class', 'classes')} got no Gaussian: {_some(empty)}.")
     if ious is not None:
         weak = [names[k] for k in np.argsort(ious).tolist() if k in names and ious[k] < KNOWN_CLASS]

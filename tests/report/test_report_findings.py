@@ -86,6 +86,11 @@ DOUBTFUL = [{"name": "v7", "reliability": 0.5}, {"name": "v8", "reliability": No
             "1 of 2 masks disagrees with the other views in more than 30 % of its pixels: v7",
         ),
         ({"classes": [CUP, BOX]}, 0.9, "1 class got no Gaussian: cup"),
+        (
+            {"classes": [CUP, BOX], "ids": {"objects": 2}},
+            0.9,
+            "1 of 2 objects that were found got no Gaussian, as other views give what their masks show to others: cup",
+        ),
         ({"classes": []}, 0.9, "No Gaussian is part of an object"),
         ({}, 0.3, "overlap by less than half (IoU below 0.5): cup"),
         ({"gaussians": {"unobserved": 40}}, 0.9, "40 % of the Gaussians were seen by no mask"),
