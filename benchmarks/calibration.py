@@ -25,11 +25,12 @@ from results import machine, markdown
 from scipy.optimize import minimize_scalar
 
 from gsseg_core.data.dataset import Dataset
+from gsseg_core.data.label_evidence import VOTE_UNIT
 from gsseg_core.data.view import View, spread
 from gsseg_core.demo.table_scene import build_demo
 from gsseg_core.learn.calibrate import calibrate
 from gsseg_core.learn.em.em_learner import EMLearner, EMSettings
-from gsseg_core.learn.learner import VOTE_UNIT, Learner
+from gsseg_core.learn.learner import Learner
 from gsseg_core.learn.mask_reliability import MaskChecker
 from gsseg_core.learn.registry import make_learner
 from gsseg_core.learn.temperature import (

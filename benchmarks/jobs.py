@@ -21,7 +21,7 @@ from gsseg_core.data.dataset import Dataset
 from gsseg_core.data.view import View, spread
 from gsseg_core.freed_memory import keep_freed_memory
 from gsseg_core.learn.em.em_learner import EMLearner, EMSettings
-from gsseg_core.learn.learner import UNITS, Learner
+from gsseg_core.learn.learner import Learner
 from gsseg_core.learn.vote_learner import VoteLearner
 from gsseg_core.metrics import Evaluation
 from gsseg_core.raster.backends import make_operator
@@ -133,9 +133,9 @@ def _lift_view(scene: GaussianScene, view: View, runs: int) -> dict[str, Any]:
         "instructions": work.instructions,
         "difference": difference,
         "sums": timed(lambda: Lifted.of(tiles, mask), runs),
-        "lift": timed(lambda: operator.vote(mask, None, total, UNITS), runs),
+        "lift": timed(lambda: operator.vote(mask, None, total), runs),
         "observe": timed(lambda: operator.observe(mask), runs),
-        "all": timed(lambda: make_operator(scene, camera).vote(mask, None, total, UNITS), runs),
+        "all": timed(lambda: make_operator(scene, camera).vote(mask, None, total), runs),
         "first": timed(first, runs),
     }
 

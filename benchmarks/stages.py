@@ -16,7 +16,6 @@ from gsseg_core.data.dataset import Dataset
 from gsseg_core.data.view import View, spread
 from gsseg_core.export.class_files import export_classes
 from gsseg_core.learn.em.em_learner import EMLearner
-from gsseg_core.learn.learner import UNITS
 from gsseg_core.learn.vote_learner import VoteLearner
 from gsseg_core.live.session import LiveSession
 from gsseg_core.raster.backends import make_operator
@@ -82,7 +81,7 @@ def _view_stages(scene: GaussianScene, views: list[View], num_classes: int, runs
         add("bin", lambda p=projected, c=camera: assign(p, c.width, c.height))
         add("blend", operator.transmittance)
         add(f"render {num_classes} classes", lambda o=operator: o.render(codes))
-        add("lift to votes", lambda o=operator, m=mask: o.vote(m, None, total, UNITS))
+        add("lift to votes", lambda o=operator, m=mask: o.vote(m, None, total))
         add("observe", lambda o=operator, m=mask: o.observe(m))
         add("shares", asked_anew(observation, mine, rest))
         add("adjoint, 3 channels", lambda o=operator, m=mask: o.adjoint(np.repeat(m[..., None], 3, axis=2)))

@@ -26,6 +26,9 @@ from gsseg_core.csr_rows import CSRRows
 from gsseg_core.data.label_images import UNKNOWN
 from gsseg_core.kernels.compiler import called_by_kernels
 
+VOTE_UNIT = 2.0**-24  # votes are counted in whole multiples of this many px, so that adding and taking back are exact
+UNITS = 1 / VOTE_UNIT  # units per px
+
 
 @dataclass(frozen=True, eq=False)
 class LabelEvidence:
@@ -155,6 +158,6 @@ class LabelEvidence:
 
 
 @called_by_kernels
-def vote_units(weight: np.float32, votes: np.float64, units: float) -> np.int64:
+def vote_units(weight: np.float32, votes: np.float64) -> np.int64:
     """Round a (Gaussian, label) pair's votes for a class to whole units; all code rounds here, so sums stay exact."""
-    return np.int64(np.rint(np.float64(weight) * votes * units))
+    return np.int64(np.rint(np.float64(weight) * votes * UNITS))

@@ -12,6 +12,7 @@ from typing import Any, TypeVar
 import numpy as np
 
 from gsseg_core.csr_rows import CSRRows
+from gsseg_core.data.label_evidence import VOTE_UNIT
 from gsseg_core.data.soft_masks import SeenLabels
 from gsseg_core.data.view import View
 from gsseg_core.errors import NoUsableViewsError, SettingsError, StateMismatchError
@@ -33,9 +34,6 @@ from gsseg_core.scene.gaussian_scene import GaussianScene
 from gsseg_core.several_at_once import each_with_made, several_at_once
 from gsseg_core.spatial.row_order import along_curve
 from gsseg_core.text import counted
-
-VOTE_UNIT = 2.0**-24  # votes are counted in whole multiples of this many px, so that adding and taking back are exact
-UNITS = 1 / VOTE_UNIT  # units per px
 
 Self = TypeVar("Self", bound="Learner")
 R = TypeVar("R")
@@ -161,7 +159,7 @@ class Learner(ABC):
         """
         view, observation = self._observed(name), self._prepared.get(name)
         if observation is not None:
-            observation.vote(self._votes, UNITS, -1)
+            observation.vote(self._votes, sign=-1)
         else:
             self._lift(view, read_mask(view, self.num_classes), -1)
         self.forget(name)
@@ -251,7 +249,7 @@ class Learner(ABC):
         self.rejected.clear()
         self._prepared.clear()
         if state.whole_rays:
-            self._votes = votes_cast_anew(state, self._operator_of, self._used_labels, UNITS, votes.order)
+            self._votes = votes_cast_anew(state, self._operator_of, self._used_labels, votes.order)
 
     def vote_codes(self) -> np.ndarray:
         """Votes as probabilities, (N, K) float32; a row of zeros where no labelled pixel saw the Gaussian."""
@@ -265,11 +263,11 @@ class Learner(ABC):
         """Votes of all other views as probabilities, as `vote_rows` has those of all."""
         observation = self.observation(name)
         with _VOTES_LENT:
-            observation.vote(self._votes, UNITS, -1)
+            observation.vote(self._votes, sign=-1)
             try:
                 return self.vote_rows()
             finally:
-                observation.vote(self._votes, UNITS)
+                observation.vote(self._votes)
 
     def evidence(self) -> np.ndarray:
         """Weight of the labelled pixels that saw each Gaussian, over all views, in px, (N,) float32."""
@@ -308,7 +306,7 @@ class Learner(ABC):
     def _lift(self, view: View, seen: SeenLabels, sign: int, operator: ViewOperator | None = None) -> bool:
         """Add a view's votes, or take them away, and keep nothing of it; tell whether it sees any Gaussian."""
         operator = operator or self._operator_of(view)
-        return operator.vote(*self._used_labels(seen, operator), self._votes, UNITS, sign)
+        return operator.vote(*self._used_labels(seen, operator), self._votes, sign=sign)
 
     def _opened(self, view: View, operator: ViewOperator | None = None) -> Observation | UnusableViewError:
         """Prepare a new view; return the error that says why, where it cannot be used."""
@@ -325,13 +323,13 @@ class Learner(ABC):
             return False
         total = self._votes if total is None else total
         if opened is not None:  # First: where there is no memory for its votes, the view in whose place it comes stays.
-            opened.vote(total, UNITS)
+            opened.vote(total)
         try:
             if view.name in self.views:
                 self.retract(view.name)
         except BaseException:
             if opened is not None:
-                opened.vote(total, UNITS, -1)
+                opened.vote(total, sign=-1)
             raise
         if opened is not None:
             self._prepared.keep(view.name, opened)

@@ -19,7 +19,7 @@ import numpy as np
 
 from gsseg_core.csr_rows import CSRRows, starts
 from gsseg_core.data.class_names import check_same_names
-from gsseg_core.data.label_evidence import LabelEvidence
+from gsseg_core.data.label_evidence import UNITS, LabelEvidence
 from gsseg_core.data.label_images import DIGEST_BYTES, PER_VIEW, UNKNOWN
 from gsseg_core.data.soft_masks import TOLERANCE, SeenLabels
 from gsseg_core.data.view import View
@@ -58,7 +58,7 @@ OBJECTS_OF_ONE_SESSION = "holds objects that its own session found and numbered 
 _MOST_VIEWS = 2**31 - 1
 _MOST_DROPPED = 1 << 20  # that are listed: in memory, each takes some 60 bytes
 _MOST_VOTES = 2.0**62
-_VIEW_VOTES = 2.0**24 * LIMITS.max_pixels  # votes of one view for one Gaussian, at most, in units of `VOTE_UNIT`
+_VIEW_VOTES = UNITS * LIMITS.max_pixels  # votes of one view for one Gaussian, at most, in units of `VOTE_UNIT`
 
 
 @dataclass(frozen=True, eq=False)

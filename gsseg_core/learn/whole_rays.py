@@ -7,7 +7,7 @@ from collections.abc import Callable
 import numpy as np
 
 from gsseg_core.csr_rows import CSRRows, starts
-from gsseg_core.data.label_evidence import LabelEvidence
+from gsseg_core.data.label_evidence import UNITS, LabelEvidence
 from gsseg_core.data.soft_masks import SeenLabels
 from gsseg_core.data.view import View
 from gsseg_core.learn.learner_state import State
@@ -21,7 +21,7 @@ _ROUNDING = 1e-3  # what is taken from a vote differs from what was added by at 
 
 def votes_cast_anew(
     state: State, operator_of: Callable[[View], ViewOperator], used: Callable[[SeenLabels, ViewOperator], SeenLabels],
-    units: float, order: RowOrder,
+    order: RowOrder,
 ) -> VoteTotal:  # fmt: skip
     """Return the votes of a state, in pages of an order; those of the views that it keeps by rays that end at surfaces.
 
@@ -34,16 +34,16 @@ def votes_cast_anew(
     for view in state.views:
         operator = operator_of(view)
         seen = used(view.read_seen(), operator)
-        operator.vote(*seen, anew, units)
+        operator.vote(*seen, anew)
         if not all_kept:
-            _take(left, taken, operator, seen, units)
+            _take(left, taken, operator, seen)
     cast = taken.rows()
     rest, rounded = left.rows().united(cast.with_data(_ROUNDING * cast.data.astype(np.float32)))
     anew.add_rows(rest.with_data(np.where(np.abs(rest.data) <= rounded.data, 0, rest.data)).nonzero())
     return anew
 
 
-def _take(left: VoteTotal, taken: VoteTotal, operator: ViewOperator, seen: SeenLabels, units: float) -> None:
+def _take(left: VoteTotal, taken: VoteTotal, operator: ViewOperator, seen: SeenLabels) -> None:
     """Take the votes of a view by whole rays from a sum; `taken` counts how many were, for or against."""
     present = np.unique(seen.labels[seen.labels >= 0])  # Where the mask has evidence of its own, 0 to L - 1.
     rows = (seen.evidence or LabelEvidence(present)).votes
@@ -53,7 +53,7 @@ def _take(left: VoteTotal, taken: VoteTotal, operator: ViewOperator, seen: SeenL
         for c in range(len(some)):
             of_label = slice(*rows.indptr[first + c : first + c + 2])
             for k, vote in zip(rows.indices[of_label], rows.data[of_label], strict=True):
-                cast = _column(np.rint(weights[:, c] * vote * units).astype(np.int64), k)
+                cast = _column(np.rint(weights[:, c] * vote * UNITS).astype(np.int64), k)
                 left.add_rows(cast.with_data(-cast.data))
                 taken.add_rows(cast.with_data(np.abs(cast.data)))
 

@@ -11,9 +11,9 @@ import numpy as np
 
 from gsseg_core.csr_rows import CSRRows
 from gsseg_core.data.dataset import Dataset
+from gsseg_core.data.label_evidence import VOTE_UNIT
 from gsseg_core.data.view import View
 from gsseg_core.errors import SettingsError
-from gsseg_core.learn.learner import UNITS, VOTE_UNIT
 from gsseg_core.learn.learner_state import Learnt
 from gsseg_core.learn.vote_learner import VoteLearner
 from gsseg_core.live.results import Outcome, Rejection
@@ -171,7 +171,7 @@ class PerViewSession(LiveSession):
             left = VoteTotal.from_rows(votes.state().votes, votes.num_classes, along_curve(self.scene))
             for view in views:
                 if observation := table.adopt(view):
-                    observation.vote(left, UNITS, -1)
+                    observation.vote(left, sign=-1)
             rest = left.rows()
             table.recall(rest.with_data(rest.data * VOTE_UNIT))
         else:

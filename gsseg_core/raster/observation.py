@@ -115,8 +115,8 @@ class Observation(ABC):
     def votes(self) -> np.ndarray:
         """Sum of weights of each pair, the entries of W^T onehot(y) that are not zero: (P,) float32, in px."""
 
-    def vote(self, total: Any, units: float, sign: int = 1) -> None:
-        """Add the votes to a total of all views, or take them away (sign -1), exactly: in whole units.
+    def vote(self, total: Any, *, sign: int = 1) -> None:
+        """Add the votes to a total of all views, or take them away (sign -1), exactly.
 
         The total is a `VoteTotal`, or what `gsseg_core.raster.backends.vote_total` has in place of it. Raises
         `SceneValueError` where it has too few Gaussians or classes, or is something else.
@@ -125,7 +125,7 @@ class Observation(ABC):
         check_total(self.name, total, rows, classes)
         borders = self.start[np.arange(_PARTS + 1) * len(self.ids) // _PARTS]
         gaussians, parts = np.repeat(self.ids, np.diff(self.start)), np.stack([borders[:-1], borders[1:]], axis=1)
-        total.add(PairVotes(gaussians, self.labels, self.votes(), parts), self.evidence.votes, units, sign)
+        total.add(PairVotes(gaussians, self.labels, self.votes(), parts), self.evidence.votes, sign)
 
     def shares(self, likelihood: np.ndarray, rest: np.ndarray) -> VoteShares:
         """Share one vote per labelled pixel, times its weight, among the Gaussians that made it.

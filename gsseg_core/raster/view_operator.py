@@ -104,9 +104,7 @@ class ViewOperator(ViewRenderer):
         self._check_labels(labels, None)
         return self._lift(labels)
 
-    def vote(
-        self, labels: np.ndarray, evidence: LabelEvidence | None, total: VoteTotal, units: float, sign: int = 1
-    ) -> bool:
+    def vote(self, labels: np.ndarray, evidence: LabelEvidence | None, total: VoteTotal, *, sign: int = 1) -> bool:
         """Add the votes of a mask to those of other views, as `Observation.vote` does, and keep nothing of the view.
 
         Parameters
@@ -115,8 +113,6 @@ class ViewOperator(ViewRenderer):
             The mask, as for `observe`, which also says what is raised.
         total : VoteTotal
             Votes of N Gaussians for K classes, among them all that the mask speaks of; added to.
-        units : float
-            Units per px of weight; a power of 2.
         sign : int
             1 to add, -1 to take back; what was added is taken back exactly.
 
@@ -135,7 +131,7 @@ class ViewOperator(ViewRenderer):
         if isinstance(total, VoteTotal):
             self._check_rows(total.shape[0], None, what="votes")
         check_total(self.camera.name, total, self.num_gaussians, most + 1)
-        return self._vote(labels, evidence, total, units, sign)
+        return self._vote(labels, evidence, total, sign)
 
     def without(self, hidden: np.ndarray) -> ViewOperator:
         """Make the view without some Gaussians, (N,) bool; indices stay, and nothing is projected again.
@@ -210,11 +206,9 @@ class ViewOperator(ViewRenderer):
     def _lift(self, labels: np.ndarray) -> LabelWeights:
         return self._observe(labels, None).by_label()
 
-    def _vote(
-        self, labels: np.ndarray, evidence: LabelEvidence | None, total: VoteTotal, units: float, sign: int
-    ) -> bool:
+    def _vote(self, labels: np.ndarray, evidence: LabelEvidence | None, total: VoteTotal, sign: int) -> bool:
         observation = self.observe(labels, evidence)
-        observation.vote(total, units, sign)
+        observation.vote(total, sign=sign)
         return observation.num_pairs > 0
 
     def _check_weights(self, weights: np.ndarray) -> None:

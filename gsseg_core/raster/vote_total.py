@@ -33,7 +33,7 @@ class PairVotes(NamedTuple):
 
 
 class VoteTotal:
-    """Votes of N Gaussians for K classes, in whole units, int64: what is added can be taken back exactly.
+    """Votes of N Gaussians for K classes, in whole `VOTE_UNIT`s, int64: what is added can be taken back exactly.
 
     Pages hold the Gaussians in an `order`, by default their own. Nothing but memory and time depends on it.
 
@@ -67,14 +67,14 @@ class VoteTotal:
         """How many classes there can be, with the votes that there are, in so many bytes; K at least."""
         return max(self.shape[1], (nbytes - self._pages.nbytes) // (4 * self._table.shape[1]))
 
-    def add(self, cast: PairVotes, label_votes: CSRRows, units: float, sign: int = 1) -> None:
-        """Add the votes of a view, or take them back: `units` per px of weight, a power of 2, `sign` 1 or -1.
+    def add(self, cast: PairVotes, label_votes: CSRRows, sign: int = 1) -> None:
+        """Add the votes of a view, or take them back with the `sign` -1.
 
         A pixel of each label votes as the rows `label_votes` say, float64. Where there is too little memory, nothing
         has changed.
         """
         self._make_pages(_number_pairs(self._table, self.order.places, cast, label_votes, self._count))
-        add_pairs(self._table, self.order.places, self._pages.reshape(-1), cast, label_votes, units, sign)
+        add_pairs(self._table, self.order.places, self._pages.reshape(-1), cast, label_votes, sign)
 
     def add_rows(self, rows: CSRRows, first: int = 0) -> None:
         """Add votes in units, int64, to those of consecutive Gaussians from the `first` on."""
@@ -173,7 +173,7 @@ def _number_pairs(
 def add_pairs(
     table: np.ndarray, places: np.ndarray,  # (K, blocks) with a page wherever one is needed; (N,) int32
     cells: np.ndarray,  # (pages * PAGE,)
-    cast: PairVotes, label_votes: CSRRows, units: float, sign: int,
+    cast: PairVotes, label_votes: CSRRows, sign: int,
 ) -> None:  # fmt: skip
     """Add a view's votes to the cells of pages, or take them away; see `VoteTotal.add`."""
     gaussians, labels, weights, parts = cast
@@ -181,7 +181,7 @@ def add_pairs(
         for s in range(parts[part, 0], parts[part, 1]):
             prefetch(cells, _next_cell(table, places, cast, label_votes, s, parts[part, 1] - 1))
             for z in range(label_votes.indptr[labels[s]], label_votes.indptr[labels[s] + 1]):
-                added = sign * vote_units(weights[s], label_votes.data[z], units)
+                added = sign * vote_units(weights[s], label_votes.data[z])
                 cells[_cell(table, places[gaussians[s]], label_votes.indices[z])] += added
 
 

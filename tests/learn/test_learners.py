@@ -15,6 +15,7 @@ from hypothesis import strategies as st
 from operator_cases import lifting
 from small_scenes import NAMES, NUM_CLASSES, OUT_OF_SIGHT, balls_on_a_table, clean_views, look_at, mean_iou, taught
 
+from gsseg_core.data.label_evidence import VOTE_UNIT
 from gsseg_core.data.label_images import UNKNOWN, write_mask
 from gsseg_core.data.soft_masks import SeenLabels
 from gsseg_core.data.view import View
@@ -22,7 +23,7 @@ from gsseg_core.errors import MaskSizeError, NoUsableViewsError, SettingsError, 
 from gsseg_core.learn.em import em_learner, spatial_prior
 from gsseg_core.learn.em.em_learner import EMLearner, EMSettings
 from gsseg_core.learn.gradient_learner import GradientLearner
-from gsseg_core.learn.learner import VOTE_UNIT, Learner
+from gsseg_core.learn.learner import Learner
 from gsseg_core.learn.mask_reliability import check_views
 from gsseg_core.learn.vote_learner import VoteLearner
 from gsseg_core.raster.backends import make_operator

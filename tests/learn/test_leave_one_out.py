@@ -9,11 +9,10 @@ from hypothesis import strategies as st
 from small_scenes import NUM_CLASSES, balls_on_a_table, clean_views
 
 from gsseg_core.csr_rows import CSRRows
-from gsseg_core.data.label_evidence import LabelEvidence
+from gsseg_core.data.label_evidence import UNITS, LabelEvidence
 from gsseg_core.data.view import View
 from gsseg_core.learn.em.em_kernels import leave_one_out_counts
 from gsseg_core.learn.em.em_learner import EMLearner
-from gsseg_core.learn.learner import UNITS
 from gsseg_core.learn.vote_resolution import resolved_votes
 from gsseg_core.raster.observation import Observation
 

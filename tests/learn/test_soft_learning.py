@@ -23,13 +23,13 @@ from small_scenes import (
 
 from gsseg_core.cli.main import main
 from gsseg_core.csr_rows import CSRRows
-from gsseg_core.data.label_evidence import LabelEvidence
+from gsseg_core.data.label_evidence import VOTE_UNIT, LabelEvidence
 from gsseg_core.data.label_images import UNKNOWN
 from gsseg_core.data.soft_masks import SeenLabels
 from gsseg_core.data.view import View
 from gsseg_core.errors import UnknownLabelError
 from gsseg_core.learn.em.em_learner import EMLearner, EMSettings
-from gsseg_core.learn.learner import VOTE_UNIT, Learner
+from gsseg_core.learn.learner import Learner
 from gsseg_core.learn.mask_reliability import check_views
 from gsseg_core.learn.registry import LEARNERS, make_learner
 from gsseg_core.learn.vote_learner import VoteLearner

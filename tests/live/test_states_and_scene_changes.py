@@ -10,12 +10,12 @@ import pytest
 from living_sessions import FAR, SCENE, VIEWS, K, as_refused, other_room, session, votes
 from small_scenes import NAMES
 
+from gsseg_core.data.label_evidence import VOTE_UNIT
 from gsseg_core.errors import (
     SettingsError,
     StateFileError,
     StateMismatchError,
 )
-from gsseg_core.learn.learner import VOTE_UNIT
 from gsseg_core.live.living_session import LivingSession
 from gsseg_core.live.per_view_session import PerViewSession
 from gsseg_core.live.session import LiveSession

@@ -18,11 +18,10 @@ from operator_cases import dense, make_camera, make_scene, random_mask, random_v
 from simulated_blocks import take_turns
 
 from gsseg_core.csr_rows import CSRRows
-from gsseg_core.data.label_evidence import LabelEvidence
+from gsseg_core.data.label_evidence import UNITS, LabelEvidence
 from gsseg_core.data.view import View
 from gsseg_core.errors import GssegError, SceneValueError
 from gsseg_core.learn.em import em_gpu_kernels, em_kernels
-from gsseg_core.learn.learner import UNITS
 from gsseg_core.live.living_session import LivingSession
 from gsseg_core.raster.backends import make_operator, vote_total
 from gsseg_core.raster.cpu import tiling
@@ -157,13 +156,13 @@ def test_votes_of_many_views_are_summed_where_they_lie_and_end_on_the_cpu(
     with vote_total(theirs, "cuda") as total:
         assert isinstance(total, torch.Tensor) == fits
         for mask, means in views:
-            gpu.observe(mask, means).vote(total, UNITS)
+            gpu.observe(mask, means).vote(total)
     for mask, means in views:
-        cpu.observe(mask, means).vote(ours, UNITS)
+        cpu.observe(mask, means).vote(ours)
     np.testing.assert_allclose(theirs.dense(), ours.dense(), atol=1e-5 * UNITS)
     with vote_total(theirs, "cuda") as total:
         for mask, means in views:
-            gpu.observe(mask, means).vote(total, UNITS, -1)
+            gpu.observe(mask, means).vote(total, sign=-1)
     assert (theirs.dense() == 7).all()
 
 

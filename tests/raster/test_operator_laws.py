@@ -14,7 +14,6 @@ from operator_backends import CPU
 from operator_cases import dense, make_camera, make_scene, moved, random_mask, random_view, rigid, spread
 
 from gsseg_core.data.label_evidence import LabelEvidence
-from gsseg_core.learn.learner import UNITS
 from gsseg_core.raster.view_renderer import PixelGrid
 from gsseg_core.raster.vote_total import VoteTotal
 from gsseg_core.scene.camera import Camera
@@ -245,10 +244,10 @@ def test_votes_that_keep_nothing_of_a_view_are_those_of_its_observation_to_the_l
         evidence = LabelEvidence(np.array([1, 5], np.int32), mass.astype(np.float32), np.array([1, 4, 5], np.int32))
     observation = operator.observe(mask, evidence)
     expected, found = (VoteTotal(len(scene), 9) for _ in range(2))
-    observation.vote(expected, UNITS)
-    assert operator.vote(mask, evidence, found, UNITS) == (len(observation.ids) > 0)
+    observation.vote(expected)
+    assert operator.vote(mask, evidence, found) == (len(observation.ids) > 0)
     np.testing.assert_array_equal(found.dense(), expected.dense())
-    operator.vote(mask, evidence, found, UNITS, -1)
+    operator.vote(mask, evidence, found, sign=-1)
     assert not found.dense().any()
 
 

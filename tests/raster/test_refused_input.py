@@ -20,16 +20,16 @@ def test_what_kernels_would_take_for_places_beyond_their_tables_is_refused():
     operator, labels = make_operator(scene, camera), np.full((21, 37), 2, np.int32)
     few = LabelEvidence(np.arange(2, dtype=np.int32))
     for mask, evidence in [(labels, few), (labels + 1_000_000_000, None), (labels.astype(float), None)]:
-        for use in (operator.observe, lambda *given: operator.vote(*given, VoteTotal(120, 9), 1.0)):
+        for use in (operator.observe, lambda *given: operator.vote(*given, VoteTotal(120, 9))):
             with pytest.raises(MaskFormatError, match=r"view 'view': labels are (int32|float64) up to .* expected"):
                 use(mask, evidence)
     seen = operator.observe(labels.astype(np.uint8))
     for use in (seen.vote, lambda *given: operator.vote(labels, None, *given)):
         with pytest.raises(SceneValueError, match=r"view 'view': votes are ndarray; expected a VoteTotal"):
-            use(np.zeros((120, 9), np.int64), 1.0)
+            use(np.zeros((120, 9), np.int64))
     for total in [VoteTotal(5, 9), VoteTotal(120, 2)]:
         with pytest.raises(SceneValueError, match=r"view 'view': votes have shape .*; expected \(\d+, 3\) or more"):
-            seen.vote(total, 1.0)
+            seen.vote(total)
         assert not total.dense().any()
     with pytest.raises(SceneValueError, match=r"hidden is int64 \(120,\); expected bool \(120,\)"):
         operator.without(np.zeros(120, np.int64))  # It would be taken for indices, and nothing be hidden.
@@ -65,13 +65,13 @@ def test_codes_of_another_scene_are_refused(backend):
     labels = np.full(operator.camera.image_size[::-1], 2, np.int32)
     for count in (119, 121):
         with pytest.raises(SceneValueError, match=f"view 'view': votes are of {count} Gaussians; expected 120"):
-            operator.vote(labels, None, VoteTotal(count, 3), 1.0)
+            operator.vote(labels, None, VoteTotal(count, 3))
     with pytest.raises(SceneValueError, match=r"votes have shape \(120, 2\); expected \(120, 3\) or more"):
-        operator.vote(labels, None, VoteTotal(120, 2), 1.0)
+        operator.vote(labels, None, VoteTotal(120, 2))
     seen = operator.observe(labels)
     for shape in [(seen.ids[-1], 3), (120, 2)]:
         with pytest.raises(SceneValueError, match=rf"votes have shape .* expected \({seen.ids[-1] + 1}, 3\) or more"):
-            seen.vote(VoteTotal(*shape), 1.0)
+            seen.vote(VoteTotal(*shape))
     some = np.zeros((len(operator.ids) - 1, 3), np.float32)
     with pytest.raises(SceneValueError, match=f"codes are of {len(some)} Gaussians; expected {len(some) + 1}"):
         operator.blend_seen(some)

@@ -65,14 +65,14 @@ def test_views_that_are_added_and_taken_back_in_any_order_leave_the_sums_of_a_de
         else:
             view, sign = cast(rng, n, k), 1
             there.append(view)
-        total.add(*view, UNITS, sign)
+        total.add(*view, sign)
         expected += sign * dense_votes((n, k), *view)
         np.testing.assert_array_equal(total.dense(), expected)
     for found, wanted in zip(total.rows(), CSRRows.from_dense(expected), strict=True):
         np.testing.assert_array_equal(found, wanted)
         assert found.dtype == wanted.dtype
     for view in there:
-        total.add(*view, UNITS, -1)
+        total.add(*view, -1)
     assert not len(total.rows().data)
 
 
@@ -82,7 +82,7 @@ def test_the_order_of_views_and_of_gaussians_in_pages_changes_nothing_but_the_pa
     for order in permutations(views):
         total = VoteTotal(700, 5, some_order(rng, 700))
         for view in order:
-            total.add(*view, UNITS)
+            total.add(*view)
         found.append(total.rows())
     for rows in found[1:]:
         for one, other in zip(found[0], rows, strict=True):
@@ -156,7 +156,7 @@ def test_without_memory_for_pages_nothing_changes(monkeypatch: pytest.MonkeyPatc
     rng = np.random.default_rng(0)
     first, second = cast(rng, 600, 3), cast(rng, 600, 7)
     total = VoteTotal(600, 7)
-    total.add(*first, UNITS)
+    total.add(*first)
     before = total.dense()
 
     def full(*shape: object) -> np.ndarray:
@@ -167,5 +167,5 @@ def test_without_memory_for_pages_nothing_changes(monkeypatch: pytest.MonkeyPatc
         with pytest.raises(MemoryError):
             total._make_pages(vote_total._number_pairs(total._table, total.order.places, *second, total._count))
     np.testing.assert_array_equal(total.dense(), before)
-    total.add(*second, UNITS)
+    total.add(*second)
     np.testing.assert_array_equal(total.dense(), before + dense_votes((600, 7), *second))

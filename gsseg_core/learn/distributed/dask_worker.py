@@ -19,7 +19,6 @@ from gsseg_core.csr_rows import CSRRows
 from gsseg_core.data.view import View
 from gsseg_core.errors import GssegError
 from gsseg_core.learn.em.em_learner import EMLearner, EMSettings, OverViews
-from gsseg_core.learn.learner import UNITS
 from gsseg_core.learn.usable_views import UnusableViewError
 from gsseg_core.raster.vote_total import VoteTotal
 from gsseg_core.scene.gaussian_scene import GaussianScene
@@ -87,7 +86,7 @@ def sum_votes(shard: Shard, wanted: dict[str, Any]) -> OverViews:
     with _all_threads():
         for name in wanted:
             if name in shard.views:
-                shard.observation(name).vote(votes, UNITS)
+                shard.observation(name).vote(votes)
     return votes.rows(), {name: shard.rejected.get(name, "") for name in wanted}
 
 

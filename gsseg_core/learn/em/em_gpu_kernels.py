@@ -12,10 +12,9 @@ import numpy as np
 import torch
 
 from gsseg_core.csr_rows import CSRRows
-from gsseg_core.data.label_evidence import LabelEvidence
+from gsseg_core.data.label_evidence import UNITS, LabelEvidence
 from gsseg_core.learn.em.em_kernels import GRADIENT_UNIT, MAX_TERM
 from gsseg_core.learn.em.gpu_edges import edges_along as edges_along
-from gsseg_core.learn.learner import UNITS
 from gsseg_core.raster.gpu.device import called_by_kernels, cuda, find_gpu, gpu_kernel, launch, on_device, to_cpu
 from gsseg_core.raster.gpu.gpu_observation import GPUObservation, ShareTensors
 from gsseg_core.raster.gpu.label_sharing import halves, joined

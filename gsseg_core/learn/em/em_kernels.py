@@ -16,10 +16,9 @@ from llvmlite import ir
 from numba.core import types
 
 from gsseg_core.csr_rows import CSRRows
-from gsseg_core.data.label_evidence import LabelEvidence, vote_units
+from gsseg_core.data.label_evidence import UNITS, LabelEvidence, vote_units
 from gsseg_core.kernels.compiler import called_by_kernels, kernel
 from gsseg_core.learn.em.scene_edges import edges_along as edges_along
-from gsseg_core.learn.learner import UNITS
 from gsseg_core.learn.vote_resolution import resolve_row
 from gsseg_core.raster.observation import Observation, ViewPairs, VoteShares
 from gsseg_core.simd import intrinsic
@@ -251,7 +250,7 @@ def _subtract_row(
         for j in range(indptr[labels[s]], indptr[labels[s] + 1]):
             for z in range(first, last):
                 if classes[z] == vote_classes[j]:
-                    total[z] -= vote_units(own[s], votes[j], UNITS)
+                    total[z] -= vote_units(own[s], votes[j])
 
 
 @called_by_kernels

@@ -31,6 +31,7 @@ from typing import Any
 import numpy as np
 
 from gsseg_core.csr_rows import CSRRows
+from gsseg_core.data.label_evidence import VOTE_UNIT
 from gsseg_core.data.soft_masks import SeenLabels
 from gsseg_core.data.view import View
 from gsseg_core.errors import SettingsError
@@ -42,7 +43,7 @@ from gsseg_core.learn.em.pair_kernels import codes_without, kernels_on, rows_on
 from gsseg_core.learn.em.rejected_regions import find_rejected, split_regions
 from gsseg_core.learn.em.spatial_prior import spatial_prior, with_prior
 from gsseg_core.learn.fitted import all_or_nothing
-from gsseg_core.learn.learner import VOTE_UNIT, Learner, Progress, silent
+from gsseg_core.learn.learner import Learner, Progress, silent
 from gsseg_core.learn.vote_resolution import resolved_votes
 from gsseg_core.raster.observation import Observation, ViewPairs, VoteShares
 from gsseg_core.raster.view_operator import ViewOperator

@@ -16,7 +16,7 @@ from gsseg_core.simd import AHEAD, prefetch
 
 def add_entry_votes(
     total: VoteTotal, ids: np.ndarray,  # added to; (M,) int32, distinct
-    tiles: Tiles, lifted: Lifted, evidence: LabelEvidence, units: float, sign: int,  # units per px; a power of 2
+    tiles: Tiles, lifted: Lifted, evidence: LabelEvidence, sign: int,
 ) -> None:  # fmt: skip
     """Add a view's votes to those of others, bit for bit as `raster.observation.Observation.vote` does with pairs."""
     if not len(lifted.classes):
@@ -31,7 +31,7 @@ def add_entry_votes(
     chunks = np.arange(CHUNKS + 1)
     capacity = tiles.gaussian_start[chunks * len(ids) // CHUNKS] + extra * chunks
     cast = _list_pairs(ids, tiles, facts, packed, lifted.sums, labels.present, len(lifted.classes), capacity)
-    total.add(cast, evidence.votes, units, sign)
+    total.add(cast, evidence.votes, sign)
 
 
 @kernel(parallel=True)

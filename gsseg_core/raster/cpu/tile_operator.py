@@ -121,12 +121,10 @@ class TileOperator(ViewOperator):
     def _lift(self, labels: np.ndarray) -> LabelWeights:
         return label_weights(self.ids, self._tiles, Lifted.of(self._tiles, labels))
 
-    def _vote(
-        self, labels: np.ndarray, evidence: LabelEvidence | None, total: VoteTotal, units: float, sign: int
-    ) -> bool:
+    def _vote(self, labels: np.ndarray, evidence: LabelEvidence | None, total: VoteTotal, sign: int) -> bool:
         lifted = Lifted.of(self._tiles, labels)
         evidence = evidence or LabelEvidence(lifted.classes)
-        add_entry_votes(total, self.ids, self._tiles, lifted, evidence, units, sign)
+        add_entry_votes(total, self.ids, self._tiles, lifted, evidence, sign)
         return lifted.sees
 
 

@@ -8,6 +8,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import torch
 
+from gsseg_core.data.label_evidence import UNITS
 from gsseg_core.raster.constants import BLOCK
 from gsseg_core.raster.gpu import label_sharing as kernels
 from gsseg_core.raster.gpu.blending import THREADS
@@ -92,7 +93,7 @@ class GPUObservation(Observation):
         owner = torch.div(pairs, labels, rounding_mode="floor")
         ids, counts = torch.unique_consecutive(owner, return_counts=True)
         self.pairs = PairTensors(ids.int(), starts(counts), (pairs % labels).int())
-        self.own_votes = (ends.diff().double() / kernels.UNITS).float()
+        self.own_votes = (ends.diff().double() / UNITS).float()
         return torch.empty_like(number, dtype=torch.int32).scatter_(0, order, number.int())
 
     @cached_property
@@ -131,20 +132,20 @@ class GPUObservation(Observation):
         """P, of which nothing is copied."""
         return len(self.own_votes)
 
-    def vote(self, total: Any, units: float, sign: int = 1) -> None:
+    def vote(self, total: Any, *, sign: int = 1) -> None:
         """Add the votes to those of other views, or take them away, where these are."""
         if not isinstance(total, torch.Tensor):
-            super().vote(total, units, sign)
+            super().vote(total, sign=sign)
             return
         label_votes = RowTensors.of(self.evidence.votes, total.device)
         launch(
             kernels.add_votes, -(-len(self.pairs.ids) // 128), 128, total, *self.pairs, self.own_votes, *label_votes,
-            float(units), sign,
+            sign,
         )  # fmt: skip
 
     def votes_by_label(self) -> np.ndarray:
         """Sum of the votes of each label, (L,) float64."""
-        units = (self.own_votes.double() * kernels.UNITS).long()
+        units = (self.own_votes.double() * UNITS).long()
         return _px_by_label(units, self.pairs.labels.long(), len(self.classes))
 
     def _shares(self, likelihood: np.ndarray, rest: np.ndarray) -> VoteShares:
@@ -169,14 +170,14 @@ class GPUObservation(Observation):
             self._slots, self._label_start, self._slot_start, self._weights, self._pair, likelihood,
             of_labels[present], logs, left_over, sums,
         )  # fmt: skip
-        pairs = (sums.double() / kernels.UNITS).float()
+        pairs = (sums.double() / UNITS).float()
         of_rest = _px_by_label(left_over, present, len(rest))
         return ShareTensors(pairs, of_rest, float(logs.sum(dtype=torch.float64)))
 
 
 def _px_by_label(units: torch.Tensor, labels: torch.Tensor, count: int) -> np.ndarray:  # (S,) int64, (S,)
     """Add up units by label, in px, (L,) float64."""
-    return kernels.joined(units.new_zeros((count, 2)).index_add_(0, labels, kernels.halves(units))) / kernels.UNITS
+    return kernels.joined(units.new_zeros((count, 2)).index_add_(0, labels, kernels.halves(units))) / UNITS
 
 
 def _cut(mask: torch.Tensor, tiles: TileTensors) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:

@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 import torch
 
+from gsseg_core.data.label_evidence import UNITS
 from gsseg_core.raster.constants import BLOCK, TINY
 from gsseg_core.raster.gpu.blending import (
     BATCH,
@@ -29,9 +30,6 @@ from gsseg_core.raster.gpu.blending import (
     weigh_batch,
 )
 from gsseg_core.raster.gpu.device import called_by_kernels, cuda, gpu_kernel, to_cpu
-
-UNITS = 2.0**24
-"""Units of a px in sums."""
 
 _MOST = np.float32(2.0**26)
 """Px that a pixel's neighbours add to a sum at once, at most; more occurs only where nothing explains a label."""
@@ -234,12 +232,12 @@ def share(
 def add_votes(
     total: np.ndarray, ids: np.ndarray, start: np.ndarray, labels: np.ndarray, votes: np.ndarray,  # (N, K) added to
     indptr: np.ndarray, classes: np.ndarray, of_labels: np.ndarray,  # L rows: what a pixel of each label votes
-    units: float, sign: int,
+    sign: int,
 ) -> None:  # fmt: skip
     """Add the votes of one Gaussian to those of other views; see `raster.vote_total`."""
     m = cuda.grid(1)
     if m < ids.shape[0]:
         for s in range(start[m], start[m + 1]):
             for j in range(indptr[labels[s]], indptr[labels[s] + 1]):
-                added = np.int64(round(np.float64(votes[s]) * of_labels[j] * units))
+                added = np.int64(round(np.float64(votes[s]) * of_labels[j] * UNITS))
                 total[ids[m], classes[j]] += sign * added

@@ -11,6 +11,7 @@ from functools import cached_property
 import numpy as np
 import torch
 
+from gsseg_core.data.label_evidence import UNITS
 from gsseg_core.raster.constants import T_MIN
 from gsseg_core.raster.cpu.silhouette_kernels import ROUNDING
 from gsseg_core.raster.cpu.tiling import TILE
@@ -25,7 +26,7 @@ from gsseg_core.raster.gpu.blending import (
     pixel_in,
 )
 from gsseg_core.raster.gpu.device import called_by_kernels, cuda, gpu_kernel, launch, on_device, to_cpu
-from gsseg_core.raster.gpu.label_sharing import UNITS, add_units
+from gsseg_core.raster.gpu.label_sharing import add_units
 from gsseg_core.raster.gpu.projection import TileTensors
 from gsseg_core.raster.gpu.tensors import starts
 from gsseg_core.raster.objects_alone import ObjectsAlone
