@@ -127,7 +127,7 @@ class LiveSession:
     def number_classes(self, names: Mapping[int, str], *, keep_numbers: bool = True) -> dict[int, int]:
         """Find the ids of a segmenter's classes, by its numbers, and add those that are new; see `ids_by_name`."""
         with self._lock:
-            ids, any_new = self._classes.number(names, keep_numbers=keep_numbers)
+            ids, any_new = self._classes.number(names, self._live.num_classes, keep_numbers=keep_numbers)
             self._version += any_new
             return ids
 

@@ -49,9 +49,10 @@ class SessionClasses:
         if not self.declared:
             self.names = {0: BACKGROUND_NAME, **names}
 
-    def number(self, names: Mapping[int, str], *, keep_numbers: bool) -> tuple[dict[int, int], bool]:
+    def number(self, names: Mapping[int, str], count: int, *, keep_numbers: bool) -> tuple[dict[int, int], bool]:
         """Find the ids of a segmenter's classes as `ids_by_name` does, and add those that are new; whether any is."""
-        ids = ids_by_name(names, self.names, 0 if self.declared else self._max_classes, keep_numbers=keep_numbers)
+        most = 0 if self.declared else self._max_classes
+        ids = ids_by_name(names, self.names, most, count, keep_numbers=keep_numbers)
         named = {} if self.declared else {ids[k]: name for k, name in names.items() if ids[k]}
         added = {k: name for k, name in named.items() if self.names.get(k) != name}
         self.names = {**self.names, **added}
@@ -100,7 +101,7 @@ class SessionClasses:
 
 
 def ids_by_name(
-    names: Mapping[int, str], known: Mapping[int, str], max_classes: int, *, keep_numbers: bool = True
+    names: Mapping[int, str], known: Mapping[int, str], max_classes: int, count: int = 0, *, keep_numbers: bool = True
 ) -> dict[int, int]:
     """Find the ids of a segmenter's classes by their names.
 
@@ -115,6 +116,8 @@ def ids_by_name(
         The classes so far; of several of one name the first counts, and names like "class_07" are none.
     max_classes : int
         0: there are no new classes, and what is not known is background.
+    count : int
+        Classes that there are by number, known by a name or not: masks without names may have voted for those.
     keep_numbers : bool
         Whether the segmenter's numbers are wanted as ids.
 
@@ -137,7 +140,7 @@ def ids_by_name(
         if keep_numbers and name not in ids and k < max_classes and k not in taken:
             ids[name] = k
             taken.add(k)
-    following = max(taken) + 1
+    following = max(count, max(taken) + 1)
     for _, name in sorted(names.items()):
         if name not in ids:
             ids[name] = following

@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from small_scenes import balls_on_a_table
+from small_scenes import NUM_CLASSES, balls_on_a_table, clean_views, fed
 
 from gsseg_core.errors import UnknownLabelError
 from gsseg_core.live.session import LiveSession
@@ -51,6 +52,15 @@ def test_a_session_learns_names_once() -> None:
     assert session.version > before
     version = session.version
     assert session.number_classes({7: "chair"}) == {7: 1} and session.version == version
+
+
+def test_new_names_come_after_classes_that_have_votes_and_no_name() -> None:
+    session = fed(LiveSession(balls_on_a_table()[0]), clean_views(2))
+    before = session.codes()
+    assert session.number_classes({0: "wall", 1: "chair"}) == {0: NUM_CLASSES, 1: 1}, "masks keep the meaning they had"
+    assert session.number_classes({1: "lamp"}, keep_numbers=False) == {1: NUM_CLASSES + 1}
+    np.testing.assert_array_equal(session.codes(), before)
+    assert session.class_names == {0: "background", 1: "chair", 2: "class_02", 3: "class_03"}
 
 
 def test_a_session_with_declared_classes_learns_no_names() -> None:
