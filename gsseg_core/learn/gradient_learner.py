@@ -10,7 +10,7 @@ import torch
 
 from gsseg_core.csr_rows import CSRRows
 from gsseg_core.errors import SettingsError
-from gsseg_core.learn.fitted import all_or_nothing
+from gsseg_core.learn.all_or_nothing import all_or_nothing
 from gsseg_core.learn.learner import Learner, Progress, silent
 from gsseg_core.learn.vote_resolution import is_resolved
 from gsseg_core.raster.observation import Observation

@@ -74,7 +74,7 @@ class Outcome:
     rejected: dict[str, str]
 
 
-def fitted(name: str, learner: Learner, views: Sequence[View], report: Report, watch: Stopwatch) -> Outcome:
+def observe_and_fit(name: str, learner: Learner, views: Sequence[View], report: Report, watch: Stopwatch) -> Outcome:
     """Have a learner observe views, fit and be calibrated."""
 
     def progress(stage: str, done: int, total: int) -> None:

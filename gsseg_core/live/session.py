@@ -20,9 +20,9 @@ from gsseg_core.errors import GssegError, NoCodesError, NoUsableViewsError, Sett
 from gsseg_core.learn.learner_state import OBJECTS_OF_ONE_SESSION, Learnt, State
 from gsseg_core.learn.registry import make_learner
 from gsseg_core.learn.vote_learner import VoteLearner
-from gsseg_core.live.current_codes import Known, current_codes, current_evidence
+from gsseg_core.live.current_codes import current_codes, current_evidence
 from gsseg_core.live.living_votes import without_groups
-from gsseg_core.live.results import SCENE_CHANGED, Outcome, Rejection, Report, fitted
+from gsseg_core.live.results import SCENE_CHANGED, Outcome, Rejection, Report, observe_and_fit
 from gsseg_core.live.session_classes import SessionClasses
 from gsseg_core.progress import Stopwatch
 from gsseg_core.raster.view_operator import ViewOperator
@@ -69,14 +69,9 @@ class LiveSession:
     _cameras: list[Camera]  # of the dataset that was learnt from
 
     def __init__(
-        self,
-        scene: GaussianScene,
-        class_names: Mapping[int, str] | None = None,
-        *,
-        max_views: int = 200,
-        device: str = "cpu",
-        max_classes: int = 256,
-    ) -> None:
+        self, scene: GaussianScene, class_names: Mapping[int, str] | None = None, *,
+        max_views: int = 200, device: str = "cpu", max_classes: int = 256,
+    ) -> None:  # fmt: skip
         for name, value in (("max_views", max_views), ("max_classes", max_classes)):
             if value < 1:
                 raise SettingsError(f"{name} is {value}; expected at least 1")
@@ -183,15 +178,10 @@ class LiveSession:
         return rejection
 
     def learn(
-        self,
-        learner: str = "em",
-        dataset: Dataset | None = None,
-        *,
-        num_views: int | None = None,
-        max_steps: int | None = None,
-        report: Report = lambda stage, done, total, loss: None,
-        watch: Stopwatch | None = None,
-    ) -> Outcome:
+        self, learner: str = "em", dataset: Dataset | None = None, *,
+        num_views: int | None = None, max_steps: int | None = None,
+        report: Report = lambda stage, done, total, loss: None, watch: Stopwatch | None = None,
+    ) -> Outcome:  # fmt: skip
         """Learn class probabilities from the views kept, or from the train views of a dataset.
 
         Whatever `report` raises ends the work, and then, as after any error, nothing has changed.
@@ -227,7 +217,7 @@ class LiveSession:
             num_classes = self._classes.count_with(dataset, num_classes, self._live)
         made = make_learner(learner, scene, num_classes, max_steps=max_steps, device=self.device)
         views = spread(views, num_views)
-        outcome = fitted(learner, made, views, report, watch or Stopwatch())
+        outcome = observe_and_fit(learner, made, views, report, watch or Stopwatch())
         with self._lock:
             if era is not self._era:
                 raise NoUsableViewsError("all views were forgotten while they were learnt from; nothing was learnt")
@@ -268,24 +258,37 @@ class LiveSession:
             key = self._version, settings
             if self._segmented is not None and self._segmented[0] == key:
                 return self._segmented[1]
+            scene, names, temperature = self.scene, self.class_names, self._temperature
             # Of a dataset's views and of those that are kept; a state without either has nothing carved.
             cameras = [*self._cameras, *(view.camera for view in self._posed_views())]
             with watch.stage("codes"):
-                weighs, codes, learnt = settings.cluster and settings.weigh, self._code_rows(), self._learnt
-                evidence = current_evidence(self._live, learnt) if weighs else None
-                temperature = 1.0 if learnt is None else learnt.temperature
-                known = Known(self.scene, codes, evidence, self.class_names, cameras, temperature)
-        result = known.segmentation(settings, self.device, watch)
+                codes, weighs = self._code_rows(), settings.cluster and settings.weigh
+                evidence = current_evidence(self._live, self._learnt) if weighs else None
+        # All of that are copies: the session goes on meanwhile.
+        with watch.stage("knn"):
+            result = Segmentation.unfiltered(scene, codes, names, settings, evidence)
+        if settings.filter:
+            with watch.stage("filter"):
+                result = result.filtered(scene, settings)
+        if settings.carve:
+            with watch.stage("carve"):
+                result = result.carved(scene, cameras, self.device, settings.carve_views)
+        result = result.calibrated(temperature)
         self._segmented = key, result
-        self._scenes[result] = known.scene
+        self._scenes[result] = scene
         return result
 
     def unrefined(self) -> Segmentation:
-        """Label every Gaussian by its class probabilities as they are now; raises `NoCodesError`, as `codes` does."""
+        """Segment without refinement, beside what `segmentation` keeps; raises `NoCodesError`, as `codes` does."""
         with self._lock:
             result = Segmentation.unfiltered(self.scene, self._code_rows(), self.class_names, UNREFINED)
+            result = result.calibrated(self._temperature)
             self._scenes[result] = self.scene
         return result
+
+    @property
+    def _temperature(self) -> float:
+        return 1.0 if self._learnt is None else self._learnt.temperature
 
     def scene_of(self, result: Segmentation) -> GaussianScene:
         """Return the scene as it was for a result of `segmentation` or `unrefined`."""

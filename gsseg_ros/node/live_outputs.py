@@ -209,8 +209,6 @@ class LiveOutputs:
             kept, since, result = self._segmentation
             if kept == key or (kept[0] is key[0] and time.monotonic() - since < oldest):
                 return result
-        learnt = session.learnt
         result = session.unrefined()
-        result = result.calibrated(1.0 if learnt is None else learnt.temperature)
         self._segmentation = (key, time.monotonic(), result)
         return result

@@ -21,7 +21,7 @@ from gsseg_core.errors import (
 from gsseg_core.learn.em.em_learner import EMLearner
 from gsseg_core.live.current_codes import current_evidence
 from gsseg_core.live.session import LiveSession
-from gsseg_core.refine.settings import RefineSettings
+from gsseg_core.refine.settings import UNREFINED, RefineSettings
 from gsseg_core.segmentation import Segmentation
 
 SCENE, TRUTH = balls_on_a_table()
@@ -59,6 +59,15 @@ def test_after_learning_its_codes_hold_and_votes_speak_for_the_gaussians_that_it
     evidence = current_evidence(session._live, session.learnt)
     np.testing.assert_array_equal(evidence[known], session.learnt.evidence[known])
     np.testing.assert_array_equal(evidence[~known], session._live.evidence()[~known])
+
+
+def test_without_refinement_probabilities_are_calibrated_too_and_the_last_refined_result_stays_kept() -> None:
+    session = fed(LiveSession(SCENE, NAMES), wrong_views(8))
+    assert session.learn().learnt.temperature != 1
+    refined, found = session.segmentation(UNCARVED), session.unrefined()
+    assert session.segmentation(UNCARVED) is refined
+    for name in ("labels", "confidence", "probabilities"):
+        np.testing.assert_array_equal(getattr(found, name), getattr(session.segmentation(UNREFINED), name))
 
 
 def test_what_an_older_version_has_learnt_comes_without_its_evidence_and_all_neighbours_weigh_the_same(

@@ -35,6 +35,7 @@ from gsseg_core.data.label_evidence import VOTE_UNIT
 from gsseg_core.data.soft_masks import SeenLabels
 from gsseg_core.data.view import View
 from gsseg_core.errors import SettingsError
+from gsseg_core.learn.all_or_nothing import all_or_nothing
 from gsseg_core.learn.em import em_kernels as kernels
 from gsseg_core.learn.em.block_weights import block_weights
 from gsseg_core.learn.em.boundary_alignment import align_boundaries, reach
@@ -42,7 +43,6 @@ from gsseg_core.learn.em.confusion_model import ErrorModel
 from gsseg_core.learn.em.pair_kernels import codes_without, kernels_on, rows_on
 from gsseg_core.learn.em.rejected_regions import find_rejected, split_regions
 from gsseg_core.learn.em.spatial_prior import spatial_prior, with_prior
-from gsseg_core.learn.fitted import all_or_nothing
 from gsseg_core.learn.learner import Learner, Progress, silent
 from gsseg_core.learn.vote_resolution import resolved_votes
 from gsseg_core.raster.observation import Observation, ViewPairs, VoteShares
@@ -143,8 +143,8 @@ class EMLearner(Learner):
 
     leaves_out = checks_masks = True
     error_models_: Mapping[str, ErrorModel] = {}
-    # Probabilities before it and the gradient of all views, both on the device; whether any are of the background.
-    _last_step_: Any = None
+    # What the last step began with, on the device: codes, and the gradient of all views; whether any code has class 0.
+    _last_step_: tuple[Any, Any, bool]
 
     def __init__(
         self, scene: GaussianScene, num_classes: int, settings: EMSettings | None = None, *,
@@ -173,13 +173,10 @@ class EMLearner(Learner):
         """Alternate E and M steps until a step can gain no more than the tolerance."""
         settings = self.settings
         self._require_views()
-        votes, tick = self._votes.rows(), partial(progress, "em", 0, settings.max_steps)
-        # All neighbours of a scene are found once; while a GPU tests regions, the CPU is free for that.
-        search = partial(find_neighbours, self.scene, settings.prior_k)
-        with meanwhile(search, self.device) if settings.prior_weight else nullcontext():
-            votes, rejected = self._reject_regions(votes, tick) if settings.rejects_regions else (votes, {})
+        tick = partial(progress, "em", 0, settings.max_steps)
+        votes, rejected = self._reject_regions(self._votes.rows(), tick)
         resolved = resolved_votes(votes, self._possible())
-        any_against, evidence = resolved is not votes, VOTE_UNIT * resolved.sums()
+        any_against, evidence = votes.data.min(initial=0) < 0, VOTE_UNIT * resolved.sums()
         self.observed_ = evidence > 0
         resolved, prior = resolved.united(self._spatial_prior(resolved, evidence))
         # The votes are the first step; with the prior added, J is finite from the start. What is zero now stays zero
@@ -203,8 +200,7 @@ class EMLearner(Learner):
             self.converged_ = small and last_round
             if self.converged_ or len(history) == settings.max_steps:
                 before, backend = rows_on(codes.with_data(codes.data.copy()), self.device)
-                background = codes.has_column(0)
-                self._last_step_ = before, backend.put(gradient, self.device), background
+                self._last_step_ = before, backend.put(gradient, self.device), codes.has_column(0)
             elif small:
                 models |= self._over_views(EMLearner._refit_error_models, models, tick, codes, gradient, prior.data)[1]
                 rounds.append(0)
@@ -289,10 +285,15 @@ class EMLearner(Learner):
 
         What is rejected must not speak against others: so each is tested once more, by the votes that are left.
         """
-        rejected_votes, rejected = self._over_views(EMLearner._find_rejected, dict.fromkeys(self.views), tick, votes)
-        if rejected:
-            left = votes.with_data(votes.data - rejected_votes)
-            rejected_votes, rejected = self._over_views(EMLearner._find_rejected, rejected, tick, left)
+        if not self.settings.rejects_regions:
+            return votes, {}
+        # All neighbours of a scene are found once; while a GPU tests regions, the CPU is free for that.
+        search, find = partial(find_neighbours, self.scene, self.settings.prior_k), EMLearner._find_rejected
+        with meanwhile(search, self.device) if self.settings.prior_weight else nullcontext():
+            rejected_votes, rejected = self._over_views(find, dict.fromkeys(self.views), tick, votes)
+            if rejected:
+                left = votes.with_data(votes.data - rejected_votes)
+                rejected_votes, rejected = self._over_views(find, rejected, tick, left)
         return votes.with_data(votes.data - rejected_votes).nonzero(), rejected
 
     def _over_views(
@@ -312,9 +313,7 @@ class EMLearner(Learner):
         """
         possible, device = self._possible(), self._device_of(votes)
         votes, backend = rows_on(votes, device)
-        remaining, rejected = backend.zeros(votes, np.int64), {}
-
-        least = self.settings.least_agreement
+        minus, rejected, least = backend.zeros(votes, np.int64), {}, self.settings.least_agreement
 
         def find(name: str, observation: Observation) -> tuple[np.ndarray, Observation]:
             return find_rejected(votes, observation, possible, least, device, doubted[name]), observation
@@ -323,8 +322,8 @@ class EMLearner(Learner):
             if labels.any():
                 rejected[name] = labels
                 rejected_votes = observation.evidence.without_names(~labels).votes
-                backend.subtract_votes(votes.with_data(remaining), observation, rejected_votes)
-        return -backend.returned(remaining), rejected
+                backend.subtract_votes(votes.with_data(minus), observation, rejected_votes)
+        return -backend.returned(minus), rejected
 
     def _device_of(self, votes: CSRRows) -> str:
         """Device that counts votes: those against a class are resolved on the CPU alone."""

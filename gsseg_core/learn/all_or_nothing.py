@@ -15,14 +15,14 @@ def all_or_nothing(fit: Callable[P, R]) -> Callable[P, R]:
 
     @wraps(fit)
     def whole(*args: P.args, **kwargs: P.kwargs) -> R:
-        fitted = vars(args[0])
-        before = {name: value for name, value in fitted.items() if name.endswith("_")}
+        attributes = vars(args[0])
+        before = {name: value for name, value in attributes.items() if name.endswith("_")}
         try:
             return fit(*args, **kwargs)
         except BaseException:  # Ctrl-C in a notebook, too.
-            for name in [name for name in fitted if name.endswith("_") and name not in before]:
-                del fitted[name]
-            fitted.update(before)
+            for name in [name for name in attributes if name.endswith("_") and name not in before]:
+                del attributes[name]
+            attributes.update(before)
             raise
 
     return whole
