@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import itertools
 from collections import Counter
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from typing import NamedTuple
 
@@ -59,30 +59,9 @@ def merge_states(
     dropped: tuple[bytes, ...] = ()
     votes, num_fused = CSRRows.empty(first.state.votes.num_rows, np.int64), 0
     for number, one in enumerate(saved):
-        if one.scene != first.scene or not _is_same_map(one.state.living, first.state.living):
-            raise StateMismatchError(
-                f"{one.source}: belongs to the scene {one.scene[:12]}; expected {first.scene[:12]}, that of "
-                f"{first.source}, with the same groups"
-            )
-        if one.state.whole_rays != first.state.whole_rays:
-            older, newer = (one, first) if one.state.whole_rays else (first, one)
-            raise StateFileError(
-                f"{older.source}: an older gsseg has saved it, whose rays went on behind surfaces; expected votes as "
-                f"in {newer.source}: load it in a session, which casts them anew, and save it"
-            )
-        if one.state.per_view and len(saved) > 1:
-            raise StateFileError(
-                f"{one.source}: {OBJECTS_OF_ONE_SESSION}; expected classes whose ids mean the same in all states"
-            )
-        one.state.check_names(names, one.source, "the states before it")
-        names = names_together(names, one.state.class_names)
-        for other in saved[:number]:
-            if _brings_nothing(one.state, other.state):
-                raise StateFileError(
-                    f"{one.source}: {other.source} has all its votes and views already, which would count twice; "
-                    "expected each state once"
-                )
         state = one.state
+        _check_fits(saved, number, names)
+        names = names_together(names, state.class_names)
         if without and number:
             shared, old = shared_views(state, Counter([*(view.digest for view in views.values()), *dropped]))
             state = without(state, shared, old) if shared or old else state
@@ -97,6 +76,33 @@ def merge_states(
         first.state, votes=votes.nonzero(), num_classes=num_classes, views=[*views.values()], num_fused=num_fused,
         class_names=dict(sorted(names.items())), learnt=None, dropped=dropped,
     )  # fmt: skip
+
+
+def _check_fits(saved: Sequence[Saved], number: int, names: Mapping[int, str]) -> None:
+    """Raise where one of the states cannot be added to those before it, which have these names of classes."""
+    one, first = saved[number], saved[0]
+    if one.scene != first.scene or not _is_same_map(one.state.living, first.state.living):
+        raise StateMismatchError(
+            f"{one.source}: belongs to the scene {one.scene[:12]}; expected {first.scene[:12]}, that of "
+            f"{first.source}, with the same groups"
+        )
+    if one.state.whole_rays != first.state.whole_rays:
+        older, newer = (one, first) if one.state.whole_rays else (first, one)
+        raise StateFileError(
+            f"{older.source}: an older gsseg has saved it, whose rays went on behind surfaces; expected votes as "
+            f"in {newer.source}: load it in a session, which casts them anew, and save it"
+        )
+    if one.state.per_view and len(saved) > 1:
+        raise StateFileError(
+            f"{one.source}: {OBJECTS_OF_ONE_SESSION}; expected classes whose ids mean the same in all states"
+        )
+    one.state.check_names(names, one.source, "the states before it")
+    for other in saved[:number]:
+        if _brings_nothing(one.state, other.state):
+            raise StateFileError(
+                f"{one.source}: {other.source} has all its votes and views already, which would count twice; "
+                "expected each state once"
+            )
 
 
 def _names(name: str) -> Iterator[str]:

@@ -97,26 +97,25 @@ class _Alignment(NamedTuple):
 
 def _align_regions(labels: np.ndarray, edges: np.ndarray, farthest: int) -> _Alignment:
     """Align the boundaries of a mask that as a whole stays in its place; `align_boundaries` says what is what."""
+    most = 2 * farthest - 1  # px that a boundary can be moved to either side
     region, first, area = connected_pixels(labels)
-    other, ring = _nearest_regions(region, 2 * farthest)
-    pairs, pair, lengths, strengths = _boundary_strengths(region, other, ring, edges, len(area), 2 * farthest)
-    moving = lengths[:, 2 * farthest - 1 : 2 * farthest + 1].min(axis=1) >= SHORTEST
+    other, ring = _nearest_regions(region, most + 1)
+    pairs, pair, lengths, strengths = _boundary_strengths(region, other, ring, edges, len(area), most + 1)
+    moving = lengths[:, most : most + 2].min(axis=1) >= SHORTEST
     along, weights = _lengths_and_weights(lengths)
     beside = np.flatnonzero((ring.ravel() == 1) & np.append(moving, False)[pair])
     weights = (weights / along)[pair[beside]]
     log_likelihood = _edge_log_likelihood(lengths[moving], strengths[moving])
-    still = float(log_likelihood[:, 2 * farthest - 1].sum())
+    still = float(log_likelihood[:, most].sum())
     near = slice(farthest, 3 * farthest)  # a boundary may lie this far from its edge
     tells = bool(strengths[:, near].sum() >= TELLING * sampled(edges).mean() * lengths[:, near].sum())
-    aligned = labels.copy()
-    if not tells:
-        return _Alignment(aligned, still, tells, beside, weights)
-    shifts, evidence = _shifts(pairs[moving], log_likelihood, len(area), farthest)
-    if evidence <= still + CLEAR:
-        return _Alignment(aligned, still, tells, beside, weights)
-    most = 2 * farthest - 1
-    moved = np.where(moving, np.clip(shifts[pairs[:, 0]] - shifts[pairs[:, 1]], -most, most), 0)
-    _move(region, other, ring, pair, pairs, moved, labels.ravel()[first], aligned)
+    aligned, evidence = labels.copy(), still
+    if tells:
+        shifts, of_shifts = _shifts(pairs[moving], log_likelihood, len(area), farthest)
+        if of_shifts > still + CLEAR:
+            evidence = of_shifts
+            moved = np.where(moving, np.clip(shifts[pairs[:, 0]] - shifts[pairs[:, 1]], -most, most), 0)
+            _move(region, other, ring, pair, pairs, moved, labels.ravel()[first], aligned)
     return _Alignment(aligned, evidence, tells, beside, weights)
 
 
