@@ -38,7 +38,7 @@ from gsseg_core.text import counted
 Self = TypeVar("Self", bound="Learner")
 R = TypeVar("R")
 
-_VOTES_LENT = threading.Lock()  # held while a view's votes are taken out of the sum, by one thread at a time
+_VOTES_LENT = threading.Lock()  # while a view's votes are out of the sum; not in each learner, as those travel
 
 
 def _check_num_classes(num_classes: int) -> None:

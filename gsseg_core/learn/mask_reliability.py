@@ -30,7 +30,7 @@ from gsseg_core.scene.camera import Camera
 from gsseg_core.several_at_once import each_with_made, several_at_once
 
 WORST = 4  # views that are trusted least, as pictures show them
-_ALL = 1 << 17  # px of the largest views of which all are compared; of others, every third tile
+_LARGE = 1 << 17  # px: of a larger view, every third tile is compared
 _TILE = 16  # px a side
 
 
@@ -172,13 +172,13 @@ class MaskChecker:
 
 def _is_of_all(check: ViewCheck, camera: Camera) -> bool:
     """Tell whether all pixels of a view were compared."""
-    return check.num_pixels == camera.width * camera.height <= _ALL
+    return check.num_pixels == camera.width * camera.height <= _LARGE
 
 
 def _compared(labels: np.ndarray) -> np.ndarray:  # (H, W)
     """Choose the pixels of a mask that are compared, (H, W) bool: large masks tell enough by a third of them."""
     wanted: np.ndarray = labels >= 0
-    if wanted.size > _ALL:
+    if wanted.size > _LARGE:
         # Those on the main diagonal are among them, and so is some of every grid of `grid_of`, whatever its step.
         rows, columns = (np.arange(size) // _TILE % 3 for size in wanted.shape)
         wanted &= np.equal.outer(rows, columns)

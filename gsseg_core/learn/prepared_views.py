@@ -16,7 +16,7 @@ MEMORY_BUDGET = 2 << 30  # bytes of them where the system does not say how much 
 
 R = TypeVar("R")
 
-_KEEPING = threading.Lock()  # held by the one thread that keeps a view, or an answer, at a time
+_KEEPING = threading.Lock()  # while a view or an answer is kept; not in each object, as those travel to workers
 
 
 def default_budget(device: str = "cpu") -> int:

@@ -38,9 +38,9 @@ STEPS = 5
 RIGHT = 0.3
 OUTLIERS = 1e-3  # share of pixels that carry any label of the view by chance
 _PRECISION = 0.02  # of the logarithm of the temperature
-_TINY = 1e-12
-_LEAST = np.finfo(np.float32).tiny
-_SMALLEST = float(_LEAST)
+_TINY = 1e-12  # likelihood of a label, at least
+_LEAST = np.finfo(np.float32).tiny  # in place of 0 as a divisor
+_SMALLEST = float(_LEAST)  # temperatures are above it, and below its reciprocal
 
 
 def tempered(

@@ -100,18 +100,8 @@ class Inputs:
 
     def _build(self, outputs: Outputs, built: ExitStack) -> None:
         """Begin to listen; the stack takes away what was made, at the end or where the next step fails."""
-        node, workspace = self._node, self._workspace
-        settings = workspace.settings
-        if settings.pose_source == "tf":
-            self.tf: TfPoses | None = TfPoses(node, settings.map_frame)
-        else:
-            self.tf = TfPoses.if_here(node, settings.map_frame)
-        if self.tf is not None:
-            built.callback(self.tf.close)
-        if self.tf is not None and settings.pose_source in ("tf", "auto"):
-            self.tf.listen()
-        elif settings.pose_source == "auto":
-            node.get_logger().info("pose_source is auto, and tf2_ros cannot be imported: poses come from topics alone")
+        node, workspace, settings = self._node, self._workspace, self._workspace.settings
+        self.tf = self._tf_poses(settings, built)
         self.worker: Worker[Paired] = Worker(self._fuse, settings.queue_size, lambda paired: paired.size, MOST_BYTES)
         built.callback(self.worker.stop)
         self.live = LiveOutputs(
@@ -150,6 +140,18 @@ class Inputs:
         built.callback(on_set_back(node, self._set_back).unregister)
         workspace.forget_waiting = self._forget_waiting
         built.callback(setattr, workspace, "forget_waiting", lambda: None)
+
+    def _tf_poses(self, settings: Settings, built: ExitStack) -> TfPoses | None:
+        """Make what looks up TF, which listens if poses come from there; None without tf2_ros, if it can be missed."""
+        poses = (TfPoses if settings.pose_source == "tf" else TfPoses.if_here)(self._node, settings.map_frame)
+        if poses is not None:
+            built.callback(poses.close)
+            if settings.pose_source in ("tf", "auto"):
+                poses.listen()
+        elif settings.pose_source == "auto":
+            said = "pose_source is auto, and tf2_ros cannot be imported: poses come from topics alone"
+            self._node.get_logger().info(said)
+        return poses
 
     def close(self) -> None:
         """Stop listening; a mask that is being fused is finished."""

@@ -98,6 +98,13 @@ class Settings:
             check_format(self.export_format)
         except SettingsError as error:
             raise SettingsError(f"parameter export_{error}") from error
+        self._check_meaning_of_masks()
+        self._check_cameras_and_frames()
+        self._check_classes()
+        if self.data_root and not Path(self.data_root).is_dir():
+            raise SettingsError(f"parameter data_root: {self.data_root} is no folder; expected one that exists")
+
+    def _check_meaning_of_masks(self) -> None:
         if self.cameras and self.detections_topic.startswith("/"):
             found = f"{self.detections_topic}, but there are cameras"
             raise SettingsError(f"parameter detections_topic is {found}; expected a name below that of each camera")
@@ -116,6 +123,8 @@ class Settings:
                 f"parameter class_names gives {len(self.class_names)} names, but with ids '{PER_VIEW}' the node finds "
                 "the objects and names them itself; expected it to be empty"
             )
+
+    def _check_cameras_and_frames(self) -> None:
         for name in self.cameras:
             if not _CAMERA.fullmatch(name) or self.cameras.count(name) > 1:
                 found = f"parameter cameras: {name[:60]!r} is no name, or there twice"
@@ -127,6 +136,8 @@ class Settings:
                 raise SettingsError(f"parameter {name} is '{frame}'; expected no slash before it, as TF takes none")
         if self.scene_frame == self.map_frame:
             raise SettingsError(f"parameter scene_frame is '{self.scene_frame}', as map_frame; expected another name")
+
+    def _check_classes(self) -> None:
         for index, flaw in enumerate(map(flaw_of_class_name, self.class_names)):
             if flaw:
                 raise SettingsError(f"parameter class_names: label {index} has the name {flaw}")
@@ -140,8 +151,6 @@ class Settings:
             )
         if self.class_names and not self.label_map:  # Which may make more.
             class_ids(self.obstacle_classes, dict(enumerate(self.class_names)), "parameter obstacle_classes")
-        if self.data_root and not Path(self.data_root).is_dir():
-            raise SettingsError(f"parameter data_root: {self.data_root} is no folder; expected one that exists")
 
     @classmethod
     def of(cls, values: dict[str, Any]) -> Settings:

@@ -134,7 +134,7 @@ def test_unknown_pixels_do_not_count() -> None:
 
 def test_of_large_views_a_third_is_compared_which_tells_the_same(monkeypatch: pytest.MonkeyPatch) -> None:
     every = checks()
-    monkeypatch.setattr(mask_reliability, "_ALL", 100)
+    monkeypatch.setattr(mask_reliability, "_LARGE", 100)
     for third in check_views(learner_with_bad_frames()):
         whole = every[third.name]
         assert third.num_pixels == whole.num_pixels and third.checked == pytest.approx(whole.checked / 3, rel=0.1)

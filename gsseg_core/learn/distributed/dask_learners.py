@@ -36,7 +36,7 @@ if TYPE_CHECKING:
 ATTEMPTS = 5  # how often a sum is begun anew where Dask cannot make good by itself what was lost
 _POLL = 0.01  # s
 
-Report = Callable[[int], None]
+Done = Callable[[int], None]
 """Called with how many views are done, time and again."""
 
 
@@ -78,7 +78,7 @@ class _OnWorkers(Learner):
         progress("observe", len(named), len(named))
 
     def _sum(
-        self, task: Callable[..., OverViews], views: Mapping[str, View], report: Report,
+        self, task: Callable[..., OverViews], views: Mapping[str, View], report: Done,
         by_view: Mapping[str, Any] | None = None, *values: Any,
     ) -> OverViews:  # fmt: skip
         """Sum up what a task makes of these views.
@@ -103,7 +103,7 @@ class _OnWorkers(Learner):
         raise SchedulerError(f"{name_of(self._client)}: lost results {ATTEMPTS} times; expected workers that stay")
 
     def _try_to_sum(
-        self, used: list[Future], task: Callable[..., OverViews], views: Mapping[str, View], report: Report,
+        self, used: list[Future], task: Callable[..., OverViews], views: Mapping[str, View], report: Done,
         by_view: Mapping[str, Any], values: Sequence[Any],
     ) -> OverViews:  # fmt: skip
         shares = self._deal(views, report)
@@ -127,7 +127,7 @@ class _OnWorkers(Learner):
             self._check(future)
         return self._client.gather(sums[0], direct=self._direct)
 
-    def _deal(self, views: Mapping[str, View], report: Report) -> list[_Share]:
+    def _deal(self, views: Mapping[str, View], report: Done) -> list[_Share]:
         """Have every worker prepare its share of the views, unless they have them."""
         held = {name: view for share in self._shares for name, view in share.views.items()}
         workers = find_workers(self._client)
@@ -147,7 +147,7 @@ class _OnWorkers(Learner):
                 self._shares.append(_Share(worker, shard, part))
         return self._shares
 
-    def _place_scene(self, workers: Mapping[str, int], report: Report) -> None:
+    def _place_scene(self, workers: Mapping[str, int], report: Done) -> None:
         """See to it that each worker has the scene: from a file of its own if that is the same one, else from here."""
         self._scenes = {w: f for w, f in self._scenes.items() if w in workers and f.status == "finished"}
         absent = [worker for worker in workers if worker not in self._scenes]
