@@ -54,7 +54,7 @@ class SessionClasses:
         most = 0 if self.declared else self._max_classes
         ids = ids_by_name(names, self.names, most, count, keep_numbers=keep_numbers)
         named = {} if self.declared else {ids[k]: name for k, name in names.items() if ids[k]}
-        added = {k: name for k, name in named.items() if self.names.get(k) != name}
+        added = {k: name for k, name in named.items() if class_name(self.names, k) != name}
         self.names = {**self.names, **added}
         return ids, bool(added)
 

@@ -126,6 +126,13 @@ def test_a_label_map_alone_goes_by_numbers_and_with_class_names_by_these() -> No
     assert node.classes([0, 1, 2, 3]) == [0, 1, 4, -1]
 
 
+def test_a_label_that_keeps_its_number_is_no_class_that_a_label_map_has_named() -> None:
+    node = Node(label_map={"0": "wall", "1": "floor"})
+    assert node.classes([0, 1, 2, 3]) == [4, 1, 2, 3]
+    assert node.classes([4, 0, 5, 2]) == [6, 4, 5, 2] and node.classes([5, 4]) == [5, 6]
+    assert node.session._classes.names == {0: "background", 1: "floor", 4: "wall", 6: "class_04"}
+
+
 def test_a_label_map_that_names_what_there_is_not_is_an_error_once_labels_are_known() -> None:
     node = Node(label_map={"sofa": None})
     node.space.hear(ADE)

@@ -10,6 +10,8 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 
+import numpy as np
+
 from gsseg_core.data.class_names import BACKGROUND_NAME, class_name, listed
 from gsseg_core.data.label_images import UNKNOWN
 from gsseg_core.data.label_map import map_labels
@@ -107,27 +109,28 @@ class LabelSpace:
             return seen.relabelled(self._numbered(new_names, session, source, say, keep_numbers=False), source)
         if self.heard is None and self._new_names is None:
             return seen
-        return seen.relabelled(self._ids(session, source, say), source)
+        return seen.relabelled(self._ids(seen, session, source, say), source)
 
     def ignored(self, names: Mapping[int, str]) -> set[int]:
         """Labels whose pixels become unknown."""
         return {k for k, name in names.items() if self._new_names is not None and self._new_names.of(name) is None}
 
-    def _ids(self, session: LiveSession, source: str, say: Callable[[str], None]) -> dict[int, int]:
+    def _ids(self, seen: SeenLabels, session: LiveSession, source: str, say: Callable[[str], None]) -> dict[int, int]:
         """Find the ids of the session's classes for the labels of masks that come without names."""
         labels, new_names = self.heard or self._class_names, self._new_names
         if new_names is not None and not labels:
-            return self._ids_by_number(new_names, session)
+            return self._ids_by_number(new_names, session, {*np.unique(seen.concerned).tolist()})
         labels = {0: BACKGROUND_NAME, **labels}
         names = dict(labels) if new_names is None else new_names.names(labels)
         labeled = {k: None if name is None or name.lower() == UNLABELED else name for k, name in names.items()}
         return self._numbered(labeled, session, source, say)
 
-    def _ids_by_number(self, new_names: NewNames, session: LiveSession) -> dict[int, int]:
-        """Apply the label map to labels that have no names."""
+    def _ids_by_number(self, new_names: NewNames, session: LiveSession, present: set[int]) -> dict[int, int]:
+        """Apply the label map to labels that have no names; those in the mask that stay are no class with a name."""
         labels = {k: class_name({0: BACKGROUND_NAME}, k) for k in range(self._max_classes)}
         found = map_labels(new_names.given, labels, new_names.source)
-        ids = session.number_classes({k: n for k, n in found.class_names.items() if n != labels.get(k)})
+        names = {k: name for k, name in found.class_names.items() if name != labels.get(k) or k in present}
+        ids = session.number_classes(names)
         return {k: ids.get(new, new) for k, new in found.new_ids.items()}
 
     def _numbered(
