@@ -32,6 +32,7 @@ sys.path.insert(0, str(Path(__file__).parents[1] / "tests/helpers"))
 from browser import opened_page, started_chromium, why_missing
 from playwright.sync_api import Page
 
+from gsseg_core.csr_rows import CSRRows
 from gsseg_core.data.view import View
 from gsseg_core.raster.backends import make_operator
 from gsseg_core.viewer.access import listen
@@ -179,15 +180,14 @@ def room_model(gaussians: int, classes: int) -> tuple[ViewModel, list[View]]:
     room = build_room(gaussians, num_classes=classes, num_views=4)
     rng = np.random.default_rng(0)
     sure = 1 - 0.6 * rng.beta(1, 6, gaussians).astype(np.float32)
-    probabilities = np.zeros((gaussians, classes), np.float32)
-    probabilities[np.arange(gaussians), room.truth] = sure
+    shares = CSRRows(np.arange(gaussians + 1), room.truth.astype(np.uint32), sure)
     names = {k: f"thing {k:02d}" for k in range(classes)}
-    return ViewModel(room.scene, Labelling(room.truth.astype(np.int32), probabilities, names)), [View(room.cameras[0])]
+    return ViewModel(room.scene, Labelling(room.truth.astype(np.int32), shares, names)), [View(room.cameras[0])]
 
 
 def seen(model: ViewModel, view: View) -> list[str]:
     """Names of the classes that fill a hundredth of a view and more: a toggle of another might change no pixel."""
-    labels, _, names = model.labelling
+    labels, _, names, _ = model.labelling
     image = make_operator(model.scene, view.camera).render(np.eye(len(names), dtype=np.float32)[labels])
     areas = np.bincount(image.argmax(axis=2).ravel(), minlength=len(names))
     return [names[k] for k in np.flatnonzero(areas >= areas.sum() / 100).tolist()]

@@ -108,7 +108,10 @@ class CSRRows(NamedTuple):
 
     def nonzero(self) -> CSRRows:
         """Drop entries that have become zero."""
-        kept = self.data != 0
+        return self.entries(self.data != 0)
+
+    def entries(self, kept: np.ndarray) -> CSRRows:  # (Z,) bool
+        """Copy the array with some of its entries alone."""
         return CSRRows(starts(kept)[self.indptr], self.indices[kept], self.data[kept])
 
     def take(self, ids: np.ndarray) -> CSRRows:  # (M,)
@@ -125,6 +128,12 @@ class CSRRows(NamedTuple):
         made = CSRRows.room_for(lengths, self.data.dtype)
         _copy_rows(self, rows, others, made)
         return made
+
+    def replaced_at(self, ids: np.ndarray, others: CSRRows) -> CSRRows:  # (M,) distinct; M rows
+        """Copy the array with rows of another one in place of some."""
+        rows = np.full(self.num_rows, -1)
+        rows[ids] = np.arange(len(ids))
+        return self.replaced(rows, others)
 
     def only(self, kept: np.ndarray) -> CSRRows:  # (N,) bool
         """Copy the array without the entries of some rows."""

@@ -182,7 +182,7 @@ def refine_something(device: str = "cpu") -> None:
     # What only some inputs need: soft masks, partial ones, and colours that are not of a PLY.
     quantise(np.stack([labels == 0, labels == 1]).astype(np.float32))
     rows = CSRRows.from_dense(codes)
-    rows.united(rows)
+    rows.united(rows.in_columns(rows.indices))  # as for parts of objects
     votes, own = CSRRows.from_dense(np.array([[-1, 1]])), np.zeros(1, np.int64)
     resolved_votes(votes, np.ones(2, bool))
     # Votes that are saved, loaded, merged, carried over to another scene, and given to other objects.

@@ -92,6 +92,34 @@ operator = make_operator(scene, camera)
 operator.weights()
 surface(scene, operator, PixelGrid(0, 4))
 operator.adjoint(np.ones((camera.height, camera.width, 2)))""",
+    "view and correct": """
+import numpy as np
+from gsseg_core.csr_rows import CSRRows
+from gsseg_core.data.dataset import Dataset
+from gsseg_core.data.object_tree import ObjectTree
+from gsseg_core.scene.gaussian_scene import GaussianScene
+from gsseg_core.segmentation import Segmentation
+from gsseg_core.viewer.corrections import disc, looks_alike, region
+from gsseg_core.viewer.model import Labelling, ViewModel
+from gsseg_core.viewer.picking import pick
+from gsseg_core.viewer.state import ViewerState
+scene, view = GaussianScene.load({scene!r}), Dataset({data!r}).views("train")[0]
+halves = np.arange(len(scene), dtype=np.int32) % 2
+tree = ObjectTree(np.int32([-1, -1, 1, 1]), np.float32([1, 0.7, 1, 1]), np.where(halves, 2, 0).astype(np.int32), 2, 0.5)
+read = Segmentation.from_codes(scene, np.eye(2, dtype=np.float32)[halves], dict(enumerate(["table", "ball"])))
+state = ViewerState(ViewModel(scene, Labelling.of(read), class_ids=(0, 1), tree=tree, read=read), [view], dict(), "cpu")
+camera, state.added_names[2] = view.camera, "spoon"
+middle = camera.width / 2, camera.height / 2
+for drawn in (region(camera, state.label_map(camera), *middle, 1), looks_alike(scene, camera, *middle, 0),
+              disc(camera, *middle, 3, 2)):
+    state.correct(drawn)
+state.set_level(0.85)
+state.change(lambda model: setattr(model, "min_probability", 0.5))
+state.seen()[0].nodes
+assert pick(scene, camera.center, scene.means[0] - camera.center, state.model.shown())
+state.view_votes()
+state.segmentation_npz()
+state.selection("ply")""",
     "move outlines": """
 import numpy as np
 from gsseg_core.learn.em.boundary_alignment import align_boundaries

@@ -65,9 +65,7 @@ def impute_probabilities(
         known = codes.only(sure)
         frequent = np.bincount(known.indices, weights=known.data, minlength=len(possible))
         left += _frequency(frequent, candidates) * candidates
-    imputed = np.full(codes.num_rows, -1)
-    imputed[rows] = np.arange(len(rows))
-    return codes.replaced(imputed, CSRRows.from_dense(_scaled(left)))
+    return codes.replaced_at(rows, CSRRows.from_dense(_scaled(left)))
 
 
 def _candidates(votes: CSRRows, possible: np.ndarray) -> np.ndarray:  # U rows of int64, (K,) bool

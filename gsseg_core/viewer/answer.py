@@ -99,7 +99,8 @@ class Answer:
     def _told(self, picked: Picked, votes: Sequence[ViewVote] | None) -> str:
         model, classes = self._state.model, self._state.objects.class_names
         i = picked.gaussian
-        label, probabilities = int(model.labelling.labels[i]), model.labelling.probabilities[i]
+        labels, shares, names, _ = model.labelling
+        label, probabilities = int(labels[i]), shares.take(np.array([i])).dense(len(names))[0]
         best = [k for k in np.argsort(-probabilities, kind="stable")[:MOST_CLASSES].tolist() if probabilities[k] > 0]
         likely = ", ".join(f"{shown_name(model.name(k))} {probabilities[k]:.2f}" for k in best)
         lines = [

@@ -8,6 +8,7 @@ from typing import NamedTuple
 import numpy as np
 from scipy import ndimage
 
+from gsseg_core.csr_rows import CSRRows, slices
 from gsseg_core.data.class_names import class_name
 from gsseg_core.data.label_images import UNKNOWN
 from gsseg_core.data.view import View
@@ -126,22 +127,26 @@ class Corrections:
         if not self._drawn:
             return before
         ids, drawn_labels, votes, seen = map(np.concatenate, zip(*self._drawn, strict=True))
-        num_classes = max(int(drawn_labels.max()) + 1, before.probabilities.shape[1])
-        probabilities = np.pad(before.probabilities, ((0, 0), (0, num_classes - before.probabilities.shape[1])))
-        touched, rows = np.unique(ids, return_inverse=True)
-        drawn = np.zeros((len(touched), num_classes), np.float32)
-        np.add.at(drawn, (rows, drawn_labels), votes)
-        drawn *= TRUST * np.bincount(rows, seen)[:, None] / drawn.sum(axis=1, keepdims=True)
-        mixed = probabilities[touched] + drawn
-        mixed /= mixed.sum(axis=1, keepdims=True)
-        probabilities[touched] = mixed
-        labels = before.labels.copy()
-        # A Gaussian that refinement took out of its object stays out, unless it goes to another one.
-        best = mixed.argmax(axis=1).astype(np.int32)
-        filtered = (labels[touched] == REMOVED) & (best == before.probabilities[touched].argmax(axis=1))
-        labels[touched] = np.where(filtered, REMOVED, best)
+        num_classes = max(int(drawn_labels.max()) + 1, len(before.class_names))
+        touched, rows = np.unique(ids.astype(np.int64), return_inverse=True)
+        weight, order, labels = TRUST * np.bincount(rows, seen), np.argsort(rows, kind="stable"), before.labels.copy()
+        mixed = [CSRRows.empty(0)]
+        for some in slices(len(touched), num_classes):  # With the zeros of all classes, memory is for a few alone.
+            pairs = order[slice(*np.searchsorted(rows[order], [some.start, some.stop]))]
+            drawn = np.zeros((some.stop - some.start, num_classes), np.float32)
+            np.add.at(drawn, (rows[pairs] - some.start, drawn_labels[pairs]), votes[pairs])
+            drawn *= weight[some, None] / drawn.sum(axis=1, keepdims=True)
+            learnt = before.shares.take(touched[some]).dense(num_classes)
+            drawn += learnt
+            drawn /= drawn.sum(axis=1, keepdims=True)
+            mixed.append(CSRRows.from_dense(drawn))
+            # A Gaussian that refinement took out of its object stays out, unless it goes to another one.
+            best = drawn.argmax(axis=1).astype(np.int32)
+            filtered = (labels[touched[some]] == REMOVED) & (best == learnt.argmax(axis=1))
+            labels[touched[some]] = np.where(filtered, REMOVED, best)
+        shares = before.shares.replaced_at(touched, CSRRows.vstack(mixed))
         known = {**(names or {}), **before.class_names}
-        return Labelling(labels, probabilities, {k: class_name(known, k) for k in range(num_classes)})
+        return Labelling(labels, shares, {k: class_name(known, k) for k in range(num_classes)})
 
 
 def drawn_on(scene: GaussianScene, view: View, shown: np.ndarray | None = None, device: str = "cpu") -> Drawn:

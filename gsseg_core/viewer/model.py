@@ -9,7 +9,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from gsseg_core.csr_rows import CSRRows
+from gsseg_core.csr_rows import CSRRows, largest, slices
 from gsseg_core.data.class_names import BACKGROUND_NAME, class_name
 from gsseg_core.data.object_tree import ObjectTree
 from gsseg_core.errors import UnknownLabelError
@@ -32,22 +32,21 @@ class Labelling(NamedTuple):
     """Label and class probabilities of each Gaussian, from a segmentation, a live source or corrections."""
 
     labels: np.ndarray  # (N,) int32: class, or `UNOBSERVED` (-1), or `REMOVED` (-2)
-    probabilities: np.ndarray  # (N, K) float32: by class; zeros where nothing is known, and rows may sum to less than 1
+    shares: CSRRows  # (N, K) float32: probabilities; none where nothing is known, and rows may sum to less than 1
     class_names: dict[int, str]  # names by id, for all K
     nodes: tuple[int, ...] | None = None  # ids of the classes that are nodes of a tree, and coloured by it
 
     @classmethod
     def of(cls, segmentation: Segmentation) -> Labelling:
         """Take labels, probabilities and names of a segmentation."""
-        return cls(segmentation.labels, segmentation.probabilities, dict(segmentation.class_names))
+        return cls(segmentation.labels, segmentation.shares, dict(segmentation.class_names))
 
     @classmethod
     def unknown(cls, num_gaussians: int, class_names: Mapping[int, str] | None = None) -> Labelling:
         """Label all Gaussians as unobserved."""
         names = {0: BACKGROUND_NAME, **(class_names or {})}
         names = {k: class_name(names, k) for k in range(max(names) + 1)}
-        empty = np.zeros((num_gaussians, len(names)), np.float32)
-        return cls(np.full(num_gaussians, UNOBSERVED, np.int32), empty, names)
+        return cls(np.full(num_gaussians, UNOBSERVED, np.int32), CSRRows.empty(num_gaussians), names)
 
 
 def at_level(objects: Labelling, tree: ObjectTree, granularity: float) -> Labelling:
@@ -55,18 +54,20 @@ def at_level(objects: Labelling, tree: ObjectTree, granularity: float) -> Labell
 
     Their first classes are those of the tree; others, which were added in the viewer, are on every level.
     """
-    k, added = tree.num_classes, objects.probabilities.shape[1] - tree.num_classes
+    k, added = tree.num_classes, len(objects.class_names) - tree.num_classes
     of_added = range(len(tree), len(tree) + added)
     if granularity == tree.level:
         return objects._replace(nodes=(*range(k), *of_added)) if added else objects
-    shares, nodes = tree.shares_at(granularity, CSRRows.from_dense(objects.probabilities[:, :k]), tree.leaves)
+    in_tree = objects.shares.indices < k
+    shares, nodes = tree.shares_at(granularity, objects.shares.entries(in_tree), tree.leaves)
     of_tree, first = objects.labels < k, len(nodes)
+    others = objects.shares.entries(~in_tree)
     node = tree.labels_at(granularity, np.where(of_tree, objects.labels, 0))
     place = np.where(node >= 0, np.searchsorted(nodes, node), node)
     names = tree.names(objects.class_names)
     return Labelling(
         np.where(of_tree, place, objects.labels - k + first).astype(np.int32),
-        np.concatenate([shares.dense(first), objects.probabilities[:, k:]], axis=1),
+        shares.plus(others._replace(indices=others.indices - np.uint32(k) + np.uint32(first))),
         dict(enumerate([*(names[one] for one in nodes), *(objects.class_names[k + i] for i in range(added))])),
         (*nodes, *of_added),
     )
@@ -113,7 +114,7 @@ class ViewModel:
     @cached_property
     def confidence(self) -> np.ndarray:
         """Largest probability of each Gaussian, (N,) float32; 0 where nothing is known."""
-        return self.labelling.probabilities.max(axis=1)
+        return np.asarray(largest(self.labelling.shares)[0])
 
     @property
     def labels_in_use(self) -> list[int]:
@@ -158,15 +159,12 @@ class ViewModel:
     def shown(self) -> np.ndarray:
         """Which Gaussians are shown, (N,) bool."""
         off = self.hidden | self.removed
-        labels, probabilities = self.labelling.labels, self.labelling.probabilities
+        labels, shares, names, _ = self.labelling
+        on = np.ones(len(names) + len(NO_CLASS), bool)  # labels -1 and -2 are its last two
+        on[[k for k in off if k < len(names)]] = False
+        kept: np.ndarray = on[labels]
         if self.min_probability > 0:
-            on = [k for k in range(probabilities.shape[1]) if k not in off]
-            best = probabilities[:, on].max(axis=1) if on else np.zeros(len(labels), np.float32)
-            kept: np.ndarray = best >= np.float32(self.min_probability)
-        else:
-            table = np.ones(probabilities.shape[1] + len(NO_CLASS), bool)  # labels -1 and -2 are its last two
-            table[[k for k in off if k < probabilities.shape[1]]] = False
-            kept = table[labels]
+            kept = largest(shares.with_data(shares.data * on[shares.indices]))[0] >= np.float32(self.min_probability)
         if self.min_confidence > 0:
             kept &= self.confidence >= np.float32(self.min_confidence)
         return kept
@@ -183,8 +181,8 @@ class ViewModel:
         colors = self._palette
         by_class: np.ndarray = colors[self.labelling.labels]
         # What refinement took out lies across an edge: in one colour it would be a stain on what it covers.
-        out, probabilities = self.labelling.labels == REMOVED, self.labelling.probabilities
-        by_class[out] = np.rint(probabilities[out] @ colors[: probabilities.shape[1]])
+        out, num_classes = np.flatnonzero(self.labelling.labels == REMOVED), len(self.labelling.class_names)
+        by_class[out] = np.rint(self.labelling.shares.take(out).dense(num_classes) @ colors[:num_classes])
         # Light and shade stay, as in the overlays.
         grey = self._true_colors.mean(axis=1, keepdims=True, dtype=np.float32)
         return np.rint(grey + FILL * (by_class - grey)).astype(np.uint8)
@@ -206,13 +204,16 @@ class ViewModel:
         return label
 
 
-def completed(probabilities: np.ndarray) -> np.ndarray:
-    """Fill rows (N, K) up to a sum of 1, float32: what is missing is divided among the classes that have 0."""
-    rest = 1 - probabilities.sum(axis=1, dtype=np.float64)
-    known = probabilities.max(axis=1) > 0
-    missing = (probabilities == 0) & (known & (rest > SHARES_TOLERANCE))[:, None]
-    share = rest / np.maximum(missing.sum(axis=1), 1)
-    return np.where(missing, share[:, None], probabilities).astype(np.float32)
+def completed(shares: CSRRows, num_classes: int) -> CSRRows:
+    """Fill rows (N, K) up to a sum of 1: what is missing is divided among the classes that have none."""
+    every = np.arange(shares.num_rows)
+    rest = 1 - np.bincount(np.repeat(every, np.diff(shares.indptr)), shares.data, len(every))
+    short = np.flatnonzero(shares.known() & (rest > SHARES_TOLERANCE))
+    parts, taken = [CSRRows.empty(0)], shares.take(short).nonzero()
+    share = rest[short] / np.maximum(num_classes - np.diff(taken.indptr), 1)
+    for some, block in zip(slices(len(short), num_classes), taken.blocks(num_classes), strict=True):
+        parts.append(CSRRows.from_dense(np.where(block == 0, share[some, None], block).astype(np.float32)))
+    return shares.replaced_at(short, CSRRows.vstack(parts))
 
 
 def ramp(values: np.ndarray) -> np.ndarray:

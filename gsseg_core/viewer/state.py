@@ -120,9 +120,12 @@ class ViewerState:
             labelling, shown = self.model.labelling, self.model.shown()
         # What has no class is a region as well. There may be far more classes than are in use.
         used, place = np.unique(np.maximum(labelling.labels, -1), return_inverse=True)
-        one_hot = np.eye(len(used), dtype=np.float32)[place]
-        image = make_operator(self.model.scene, camera, self.device).without(~shown).render(one_hot)
-        return np.where(image.max(axis=2) > 0, used[image.argmax(axis=2)].astype(np.int64), -1)
+        one_hot = CSRRows(np.arange(len(place) + 1), place.astype(np.uint32), np.ones(len(place), np.float32))
+        operator = make_operator(self.model.scene, camera, self.device).without(~shown)
+        anything = np.ones((len(operator.ids), 1), np.float32)
+        found = operator.strongest(one_hot, len(used), False, beside=anything)
+        assert found.beside is not None
+        return np.where(found.beside.image[..., 0] > 0, used[found.classes].astype(np.int64), -1)
 
     def correct(self, view: View) -> int:
         """Learn what was drawn in a picture of what is shown; return how many Gaussians that changed.
@@ -192,11 +195,12 @@ class ViewerState:
         with self.lock:
             objects, tree, read = self.objects, self.model.tree, self.model.read
             ids = self.model.ids() if tree is None else at_level(objects, tree, tree.level).nodes
-        labels, probabilities, names, _ = objects
-        shares, nothing = CSRRows.from_dense(completed(probabilities)), np.zeros(len(labels), bool)
+        labels, told, names, _ = objects
+        shares, nothing = completed(told, len(names)), np.zeros(len(labels), bool)
         result = Segmentation(labels, shares, names, self.model.scene.digest, nothing, CSRRows.empty(0))
         if read is not None:  # What blends into views is what was learnt, but for what was corrected.
-            same = (probabilities == read.shares.dense(len(names))).all(axis=1)
+            now, then = told.united(read.shares)
+            same = now.with_data(now.data != then.data).sums() == 0
             learnt = read.learnt.take(np.flatnonzero(same[read.clustered]))
             result = replace(result, clustered=read.clustered & same, learnt=learnt, temperature=read.temperature)
         # Classes that were added are in no tree.

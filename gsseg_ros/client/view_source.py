@@ -13,6 +13,7 @@ from rcl_interfaces.msg import ParameterValue
 from rcl_interfaces.srv import GetParameters
 from sensor_msgs.msg import PointCloud2
 
+from gsseg_core.csr_rows import CSRRows, starts
 from gsseg_core.data.class_names import class_name
 from gsseg_core.errors import StateMismatchError
 from gsseg_core.scene.gaussian_scene import GaussianScene
@@ -135,9 +136,8 @@ class RosSource:
             labels[index], confidence[index] = cloud.labels, cloud.confidence
         # A later run's cloud may have classes that turned up after this one.
         names = {k: class_name(names, k) for k in range(max(*names, 0, int(labels.max())) + 1)}
-        probabilities, known = np.zeros((len(labels), len(names)), np.float32), np.flatnonzero(labels >= 0)
-        probabilities[known, labels[known]] = confidence[known]
-        return Labelling(labels, probabilities, names)
+        known = labels >= 0
+        return Labelling(labels, CSRRows(starts(known), labels[known].astype(np.uint32), confidence[known]), names)
 
     def _listen(self, topic: str) -> None:
         if topic not in self._clouds:

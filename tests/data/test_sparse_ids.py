@@ -15,6 +15,7 @@ from small_scenes import NAMES, NUM_CLASSES, balls_on_a_table, ring, write_datas
 
 from gsseg_core import pipeline
 from gsseg_core.cli.main import main
+from gsseg_core.csr_rows import CSRRows
 from gsseg_core.data.dataset import Dataset
 from gsseg_core.data.label_images import read_mask, write_mask
 from gsseg_core.errors import UnknownLabelError
@@ -184,4 +185,5 @@ def test_the_viewer_numbers_classes_and_saves_the_users_ids() -> None:
 
 def test_probabilities_of_a_source_that_tells_the_largest_only_are_completed() -> None:
     told = np.array([[0.6, 0, 0], [0, 0, 0], [0.2, 0.3, 0.5]], np.float32)
-    np.testing.assert_allclose(completed(told), [[0.6, 0.2, 0.2], [0, 0, 0], [0.2, 0.3, 0.5]], rtol=1e-6)
+    whole = completed(CSRRows.from_dense(told), 3).dense(3)
+    np.testing.assert_allclose(whole, [[0.6, 0.2, 0.2], [0, 0, 0], [0.2, 0.3, 0.5]], rtol=1e-6)

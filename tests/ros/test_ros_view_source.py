@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from labellings import probabilities_of
 from patience import PATIENCE
 from ros_helpers import Ros, ros_fixture, wait_until  # noqa: F401
 from small_scenes import NAMES, many_classes, write_dataset
@@ -52,7 +53,8 @@ def test_live_codes_are_those_of_the_node_wherever_the_scene_lies_in_the_map(ros
             update = next_update(source)
             client.export("out", refine="paper", filter=False)
         truth = Segmentation.load(tmp_path / "out/segmentation.npz", scene)
-        labels, probabilities, names, _ = update.labelling
+        labels, _, names, _ = update.labelling
+        probabilities = probabilities_of(update.labelling)
         assert names == NAMES and update.num_views == 4
         truth = truth.filtered(scene, PAPER)
         assert np.array_equal(labels, np.where(truth.labels == REMOVED, UNOBSERVED, truth.labels))
@@ -144,8 +146,8 @@ def test_a_class_that_turned_up_in_a_run_for_somebody_else_is_shown() -> None:
     report = SimpleNamespace(scene_hash=scene.digest, classes=[], num_views=3, header=Header())
     source = source_of(scene, "3 views", report, Similarity())
     update = source.wait(0.1)
-    assert update is not None and update.labelling.probabilities.shape == (len(scene), 2)
-    assert np.flatnonzero(update.labelling.probabilities[:, 1]).tolist() == [0, 1]
+    assert update is not None and probabilities_of(update.labelling).shape == (len(scene), 2)
+    assert np.flatnonzero(probabilities_of(update.labelling)[:, 1]).tolist() == [0, 1]
     assert update.labelling.class_names[1] == "class_01"
 
 

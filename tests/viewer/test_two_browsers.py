@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 import pytest
 from browser import opened_page
+from labellings import labelled
 from patience import PATIENCE
 from small_scenes import NAMES, clean_views
 
@@ -21,13 +22,13 @@ from gsseg_core.data.view import View
 from gsseg_core.segmentation import Segmentation
 from gsseg_core.viewer.access import listen
 from gsseg_core.viewer.clients import SERVER
-from gsseg_core.viewer.model import Labelling, ViewModel
+from gsseg_core.viewer.model import ViewModel
 from gsseg_core.viewer.viewer import Viewer
 
 if TYPE_CHECKING:
     from playwright.sync_api import Browser
 
-LEARNT = Labelling(TRUTH.astype(np.int32), np.eye(4, dtype=np.float32)[TRUTH] * np.float32(0.9), dict(NAMES))
+LEARNT = labelled(TRUTH.astype(np.int32), np.eye(4, dtype=np.float32)[TRUTH] * np.float32(0.9), dict(NAMES))
 
 
 @pytest.fixture

@@ -7,6 +7,7 @@ from contextlib import closing
 
 import numpy as np
 import pytest
+from labellings import labelled
 from patience import wait_until
 from small_scenes import NAMES, balls_on_a_table, clean_views
 
@@ -17,13 +18,13 @@ import viser.transforms as vtf
 from gsseg_core.raster.backends import make_operator
 from gsseg_core.scene.camera import Camera
 from gsseg_core.viewer import server_frames
-from gsseg_core.viewer.model import Labelling, ViewModel
+from gsseg_core.viewer.model import ViewModel
 from gsseg_core.viewer.picture import Picture, cut
 from gsseg_core.viewer.server_frames import FINE_ROWS, QUICK_ROWS, Frames
 from gsseg_core.viewer.viewpoint import camera_of
 
 SCENE, TRUTH = balls_on_a_table()
-MODEL = ViewModel(SCENE, Labelling(TRUTH.astype(np.int32), np.eye(4, dtype=np.float32)[TRUTH], dict(NAMES)))
+MODEL = ViewModel(SCENE, labelled(TRUTH.astype(np.int32), np.eye(4, dtype=np.float32)[TRUTH], dict(NAMES)))
 CAMERA = clean_views(1)[0].camera
 
 

@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from labellings import labelled, probabilities_of
 from parts_of_balls import tree_of_balls
 from small_scenes import NAMES, balls_on_a_table, ring
 
@@ -48,7 +49,7 @@ def model(seed: int = 0) -> ViewModel:
     labels = TRUTH.astype(np.int32).copy()
     labels[:7], probabilities[:7] = UNOBSERVED, 0
     labels[10:13] = REMOVED
-    return ViewModel(SCENE, Labelling(labels, probabilities, dict(NAMES)))
+    return ViewModel(SCENE, labelled(labels, probabilities, dict(NAMES)))
 
 
 def test_the_list_has_every_class_with_its_colour_and_size_and_what_is_of_no_class() -> None:
@@ -94,14 +95,14 @@ def test_what_has_no_class_can_be_switched_off() -> None:
 def test_the_threshold_for_confidence_hides_the_less_sure() -> None:
     shown = model()
     shown.min_confidence = 0.75
-    assert np.array_equal(shown.shown(), shown.labelling.probabilities.max(axis=1) >= np.float32(0.75))
+    assert np.array_equal(shown.shown(), probabilities_of(shown.labelling).max(axis=1) >= np.float32(0.75))
 
 
 def test_the_threshold_for_probability_goes_by_the_shown_classes_and_not_by_labels() -> None:
     shown = model()
     shown.isolate(2)
     shown.min_probability = 0.15
-    assert np.array_equal(shown.shown(), shown.labelling.probabilities[:, 2] >= np.float32(0.15))
+    assert np.array_equal(shown.shown(), probabilities_of(shown.labelling)[:, 2] >= np.float32(0.15))
     assert (shown.labelling.labels[shown.shown()] != 2).any()
 
 
@@ -111,7 +112,7 @@ def test_colours_are_of_the_mode() -> None:
     grey = np.rint(SCENE.colors() * 255).mean(axis=1, keepdims=True)
     ball = grey + FILL * (np.array(shown.color(3)) - grey)  # the photo's light and shade, as in the overlays
     assert np.abs(shown.colors()[TRUTH == 3] - ball[TRUTH == 3]).max() <= 0.51
-    mixed = shown.labelling.probabilities[10:13] @ np.array([shown.color(k) for k in range(K)])
+    mixed = probabilities_of(shown.labelling)[10:13] @ np.array([shown.color(k) for k in range(K)])
     seen = grey[10:13] + FILL * (mixed - grey[10:13])
     assert np.abs(shown.colors()[10:13] - seen).max() <= 1.01  # taken out: as it is rendered
     shown.mode = TRUE_COLOURS
@@ -259,7 +260,9 @@ def test_a_level_lists_its_nodes_in_colours_that_stay() -> None:
     assert state.model.ids() == [0, 2, 3, 4, 5]
     assert all(fine[name].color == color for name, color in colors.items() if name in fine)
     assert fine["red ball.1"].color != fine["red ball.2"].color
-    np.testing.assert_allclose(state.model.labelling.probabilities.sum(axis=1), (state.objects.labels != -1), atol=1e-5)
+    np.testing.assert_allclose(
+        probabilities_of(state.model.labelling).sum(axis=1), (state.objects.labels != -1), atol=1e-5
+    )
     state.set_level(0.2)
     assert [row.name for row in state.model.rows() if row.label > 0] == ["red ball", "whole_001"]
     state.set_level(0.5)
@@ -331,14 +334,12 @@ def test_a_class_that_was_added_stays_apart_from_those_that_turn_up_in_a_live_so
     assert state.correct(disc(camera, *uv, 3, K)) > 0
     spoon = state.objects.labels == K
     state.model.toggle(K)
-    labels, probabilities, names, _ = state._learnt
-    wider = np.pad(probabilities, ((0, 0), (0, 1)))
-    state.replace(Labelling(labels, wider, {**names, K: "fork"}))
+    labels, _, names, _ = state._learnt
+    wider = np.pad(probabilities_of(state._learnt), ((0, 0), (0, 1)))
+    state.replace(labelled(labels, wider, {**names, K: "fork"}))
     np.testing.assert_array_equal(state.objects.labels == K + 1, spoon)
     assert state.objects.class_names[K + 1] == "spoon" and state.model.hidden == {K + 1}
-    state.replace(
-        Labelling(labels, np.pad(wider, ((0, 0), (0, 2))), {**names, K: "fork", K + 1: "cup", K + 2: "spoon"})
-    )
+    state.replace(labelled(labels, np.pad(wider, ((0, 0), (0, 2))), {**names, K: "fork", K + 1: "cup", K + 2: "spoon"}))
     np.testing.assert_array_equal(state.objects.labels == K + 2, spoon)
     assert not state.added_names and state.undo() and not (state.objects.labels == K + 2).any()
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from labellings import labelled, probabilities_of
 from operator_cases import lifting, make_scene
 from small_scenes import NAMES, balls_on_a_table, clean_views, ring, true_labels
 
@@ -14,13 +15,12 @@ from gsseg_core.raster.backends import make_operator
 from gsseg_core.scene.camera import Camera
 from gsseg_core.segmentation import REMOVED, UNOBSERVED
 from gsseg_core.viewer.corrections import Corrections, box, disc, drawn_on, looks_alike, region
-from gsseg_core.viewer.model import Labelling
 from gsseg_core.viewer.picking import ViewVotes, pick
 
 SCENE, TRUTH = balls_on_a_table()
 CAMERA = ring(5)[0]
 LABELS = true_labels(SCENE, TRUTH, CAMERA)
-LEARNT = Labelling(TRUTH.astype(np.int32), np.eye(4, dtype=np.float32)[TRUTH], dict(NAMES))
+LEARNT = labelled(TRUTH.astype(np.int32), np.eye(4, dtype=np.float32)[TRUTH], dict(NAMES))
 
 
 def ray(camera: Camera, column: float, row: float) -> np.ndarray:
@@ -116,7 +116,7 @@ def test_a_correction_relabels_what_was_drawn_on_and_nothing_else() -> None:
     now = corrections.apply(LEARNT)
     changed = now.labels != LEARNT.labels
     assert changed[TRUTH == 1].sum() > 15 and not changed[TRUTH != 1].any()
-    assert np.allclose(now.probabilities.sum(axis=1), 1, atol=1e-5)
+    assert np.allclose(probabilities_of(now).sum(axis=1), 1, atol=1e-5)
     assert (true_labels(SCENE, now.labels, CAMERA)[LABELS == 1] == 2).mean() > 0.75
 
 
@@ -126,7 +126,7 @@ def test_what_lies_behind_counts_a_correction_no_more_however_often_something_wa
     K = np.array([[60.0, 0, 32], [0, 60, 24], [0, 0, 1]])
     front = Camera("front", 64, 48, K, np.eye(4))
     rear = Camera("rear", 64, 48, K, np.array([[-1.0, 0, 0, 0], [0, 1, 0, 0], [0, 0, -1, 9], [0, 0, 0, 1]]))
-    before = Labelling(np.ones(2, np.int32), np.eye(4, dtype=np.float32)[[1, 1]], dict(NAMES))
+    before = labelled(np.ones(2, np.int32), np.eye(4, dtype=np.float32)[[1, 1]], dict(NAMES))
     often, once = Corrections(scene), Corrections(scene)
     for _ in range(20):
         often.add(disc(front, 32, 24, 1, 2))
@@ -134,7 +134,7 @@ def test_what_lies_behind_counts_a_correction_no_more_however_often_something_wa
     for corrections in (often, once):
         corrections.add(disc(rear, 37, 24, 0, 3))
     assert once.apply(before).labels[1] == 1
-    np.testing.assert_array_equal(often.apply(before).probabilities[1], once.apply(before).probabilities[1])
+    np.testing.assert_array_equal(probabilities_of(often.apply(before))[1], probabilities_of(once.apply(before))[1])
 
 
 def test_a_correction_is_taken_back_exactly_and_the_ones_before_it_stay() -> None:
@@ -144,18 +144,18 @@ def test_a_correction_is_taken_back_exactly_and_the_ones_before_it_stay() -> Non
     corrections.add(disc(CAMERA, 10, 30, 6, 3))
     assert (corrections.apply(LEARNT).labels != once.labels).any() and len(corrections) == 2
     assert corrections.undo()
-    assert np.array_equal(corrections.apply(LEARNT).probabilities, once.probabilities)
+    assert np.array_equal(probabilities_of(corrections.apply(LEARNT)), probabilities_of(once))
     assert corrections.undo() and not corrections.undo()
     assert corrections.apply(LEARNT) is LEARNT
 
 
 def test_a_correction_may_bring_a_class_of_its_own_and_wake_what_was_unobserved_or_removed() -> None:
     labels = np.where(TRUTH == 1, REMOVED, UNOBSERVED).astype(np.int32)
-    probabilities = np.where((TRUTH == 1)[:, None], LEARNT.probabilities, 0).astype(np.float32)
+    probabilities = np.where((TRUTH == 1)[:, None], probabilities_of(LEARNT), 0).astype(np.float32)
     corrections = Corrections(SCENE)
     corrections.add(region(CAMERA, LABELS, *np.argwhere(LABELS == 3)[9][::-1].tolist(), 5))
     corrections.add(region(CAMERA, LABELS, *np.argwhere(LABELS == 1)[9][::-1].tolist(), 1))
-    now = corrections.apply(Labelling(labels, probabilities, dict(NAMES)), {5: "vase"})
+    now = corrections.apply(labelled(labels, probabilities, dict(NAMES)), {5: "vase"})
     assert now.class_names[5] == "vase" and now.class_names[4] == "class_04"
     assert (now.labels[TRUTH == 3] == 5).sum() > 15
     assert (now.labels[TRUTH == 1] == REMOVED).all()  # it said no more than what was known of them

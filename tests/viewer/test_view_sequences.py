@@ -12,6 +12,7 @@ from unittest.mock import MagicMock
 
 import numpy as np
 import pytest
+from labellings import labelled, probabilities_of
 from operator_cases import make_scene
 from parts_of_balls import tree_of_balls
 from patience import wait_until
@@ -35,7 +36,7 @@ from gsseg_core.viewer.viewer import Viewer
 
 SCENE, TRUTH = balls_on_a_table()
 K = len(NAMES)
-LEARNT = Labelling(TRUTH.astype(np.int32), np.eye(K, dtype=np.float32)[TRUTH] * np.float32(0.9), dict(NAMES))
+LEARNT = labelled(TRUTH.astype(np.int32), np.eye(K, dtype=np.float32)[TRUTH] * np.float32(0.9), dict(NAMES))
 CAMERA = ring(1)[0]
 ((COLUMN, ROW),), _ = CAMERA.project(SCENE.means[TRUTH == 1].mean(axis=0, keepdims=True))
 IN_BALL = int(np.flatnonzero(TRUTH == 1)[-1])
@@ -81,7 +82,7 @@ def meanwhile(viewed: ViewerState, action: Callable[[], object]) -> Callable[[],
 
 def test_a_correction_is_of_what_is_shown_and_not_of_what_is_hidden_before_it() -> None:
     scene = make_scene([[0, 0, 4], [0, 0, 5]], [[1, 0, 0, 0]] * 2, [[0.3, 0.3, 0.01], [0.3, 0.3, 0.01]], [0.97, 0.97])
-    before = Labelling(np.array([1, 2], np.int32), np.eye(4, dtype=np.float32)[[1, 2]], dict(NAMES))
+    before = labelled(np.array([1, 2], np.int32), np.eye(4, dtype=np.float32)[[1, 2]], dict(NAMES))
     state = ViewerState(ViewModel(scene, before), [], {}, "cpu")
     state.change(lambda model: model.toggle(1))
     front = Camera("front", 64, 48, np.array([[60.0, 0, 32], [0, 60, 24], [0, 0, 1]]), np.eye(4))
@@ -95,7 +96,9 @@ def test_every_tool_leaves_what_is_hidden_as_it_is(viewer: Viewer, tool: str) ->
     viewer.panel._target.value, viewer.panel._tool.value = NAMES[3], tool
     viewer.panel.correct_at(CAMERA, COLUMN, ROW)
     labels = viewer.state.objects.labels
-    assert (labels[TRUTH == 1] == 1).all() and (viewer.state.objects.probabilities != LEARNT.probabilities).any()
+    assert (labels[TRUTH == 1] == 1).all() and (
+        probabilities_of(viewer.state.objects) != probabilities_of(LEARNT)
+    ).any()
 
 
 def test_a_class_that_was_added_is_no_node_of_the_tree_and_keeps_its_id_and_colour_on_every_level_and_in_the_file(
@@ -156,8 +159,8 @@ def test_a_class_alone_is_joined_by_all_again_though_a_hidden_one_was_corrected_
 
 def test_a_region_is_found_among_as_many_classes_as_there_may_be() -> None:
     many = 60_000
-    narrow, names = LEARNT.probabilities[:, [0, 1]], {k: f"class {k}" for k in range(many)}
-    wide = Labelling(np.where(TRUTH == 1, many - 1, 0).astype(np.int32), np.repeat(narrow, many // 2, axis=1), names)
+    narrow, names = probabilities_of(LEARNT)[:, [0, 1]], {k: f"class {k}" for k in range(many)}
+    wide = labelled(np.where(TRUTH == 1, many - 1, 0).astype(np.int32), np.repeat(narrow, many // 2, axis=1), names)
     labels = state_of(wide).label_map(CAMERA)
     np.testing.assert_array_equal(labels == many - 1, state_of().label_map(CAMERA) == 1)
 
@@ -249,7 +252,7 @@ def test_a_correction_is_of_the_class_that_was_chosen_though_classes_are_renumbe
     viewed.model.tree = None  # A live source has none.
     panel._new.value = "spoon"
     panel._add_class()
-    learnt = Labelling(LEARNT.labels, np.pad(LEARNT.probabilities, ((0, 0), (0, 1))), {**NAMES, K: "fork"})
+    learnt = labelled(LEARNT.labels, np.pad(probabilities_of(LEARNT), ((0, 0), (0, 1))), {**NAMES, K: "fork"})
     at_once, draw = meanwhile(viewed, lambda: viewed.replace(learnt)), view_corrections._view
 
     def drawn(*of: Any) -> Any:

@@ -16,6 +16,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import pytest
 from browser import opened_page
+from labellings import labelled
 from patience import PATIENCE, wait_until
 from small_scenes import balls_on_a_table, clean_views
 
@@ -68,7 +69,7 @@ CLICK = {
 
 
 def labelling(names: dict[int, str]) -> Labelling:
-    return Labelling(TRUTH.astype(np.int32), np.eye(4, dtype=np.float32)[TRUTH] * np.float32(0.9), names)
+    return labelled(TRUTH.astype(np.int32), np.eye(4, dtype=np.float32)[TRUTH] * np.float32(0.9), names)
 
 
 @contextmanager
@@ -272,7 +273,7 @@ def test_whatever_a_browser_says_the_viewer_answers_the_next_one(
 
 def test_names_that_look_alike_are_told_apart_in_the_list_of_classes() -> None:
     names = {0: "background", 1: "cup", 2: "cup", 3: "cup (2)", 4: "a" * 10**4 + "b", 5: "a" * 10**4 + "c", 6: "\x1b"}
-    learnt = Labelling(TRUTH.astype(np.int32), np.eye(7, dtype=np.float32)[TRUTH], names)
+    learnt = labelled(TRUTH.astype(np.int32), np.eye(7, dtype=np.float32)[TRUTH], names)
     viewer = Viewer(ViewModel(SCENE, learnt), listener=listen(port=PORT), draw=SERVER)
     with closing(viewer), connected(viewer) as page:
         options = heard(page, "GuiDropdownMessage", "class")["props"]["options"]

@@ -16,6 +16,7 @@ from unittest.mock import MagicMock
 import numpy as np
 import pytest
 from browser import opened_page, screenshot
+from labellings import labelled, probabilities_of
 from parts_of_balls import tree_of_balls
 from patience import PATIENCE
 from small_scenes import NAMES, clean_views, write_dataset
@@ -40,7 +41,7 @@ from gsseg_core.viewer.viewpoint import camera_of
 if TYPE_CHECKING:
     from playwright.sync_api import Browser
 
-LEARNT = Labelling(TRUTH.astype(np.int32), np.eye(4, dtype=np.float32)[TRUTH] * np.float32(0.9), dict(NAMES))
+LEARNT = labelled(TRUTH.astype(np.int32), np.eye(4, dtype=np.float32)[TRUTH] * np.float32(0.9), dict(NAMES))
 
 
 @pytest.fixture(scope="module", params=[BROWSER, SERVER])
@@ -240,7 +241,7 @@ def test_a_shift_drag_corrects_what_is_in_the_box(shown: Shown) -> None:
     shown.page.mouse.up()
     shown.page.keyboard.up("Shift")
     shown.wait(lambda: len(shown.viewer.state.corrections) == 1, "the correction")
-    assert (shown.viewer.state.objects.probabilities != LEARNT.probabilities)[TRUTH == 1].any()
+    assert (probabilities_of(shown.viewer.state.objects) != probabilities_of(LEARNT))[TRUTH == 1].any()
     (drawn,) = shown.viewer.state.corrections._drawn
     assert drawn.votes.sum() > 100  # px
 
