@@ -13,7 +13,7 @@ import numpy as np
 import viser
 
 from gsseg_core.data.class_names import class_name
-from gsseg_core.errors import GssegError
+from gsseg_core.errors import GssegError, memory_ran_out
 from gsseg_core.text import counted, html_text, printable
 from gsseg_core.viewer.picking import Picked, ViewVote
 from gsseg_core.viewer.state import ViewerState
@@ -71,14 +71,17 @@ class Answer:
         """Show errors in the browser, in place of the last answer or beside it, until somebody's next act works."""
         try:
             yield
-        except GssegError as error:
+        except Exception as error:
+            if not isinstance(error, GssegError) and not memory_ran_out(error):
+                raise
+            what = str(error) if isinstance(error, GssegError) else f"memory is not enough ({error})"
             if in_place:
                 with self._state.lock:
                     self._picked = None
                     self._offer(None)
-                    self._answer.content = self._failure = paragraph(f" {error}", title="That did not work.")
+                    self._answer.content = self._failure = paragraph(f" {what}", title="That did not work.")
             if client is not None:
-                text = printable(str(error))
+                text = printable(what)
                 client.add_notification("That did not work", text, color="red", auto_close_seconds=NOTICE)
         else:
             with self._state.lock:

@@ -48,6 +48,10 @@ class Labelling(NamedTuple):
         names = {k: class_name(names, k) for k in range(max(names) + 1)}
         return cls(np.full(num_gaussians, UNOBSERVED, np.int32), CSRRows.empty(num_gaussians), names)
 
+    def confidence(self) -> np.ndarray:
+        """Largest probability of each Gaussian, (N,) float32; 0 where nothing is known."""
+        return np.asarray(largest(self.shares)[0])
+
 
 def at_level(objects: Labelling, tree: ObjectTree, granularity: float) -> Labelling:
     """Label the nodes of a tree at a level without gaps; at its own level, the objects come back as they are.
@@ -114,7 +118,7 @@ class ViewModel:
     @cached_property
     def confidence(self) -> np.ndarray:
         """Largest probability of each Gaussian, (N,) float32; 0 where nothing is known."""
-        return np.asarray(largest(self.labelling.shares)[0])
+        return self.labelling.confidence()
 
     @property
     def labels_in_use(self) -> list[int]:

@@ -57,8 +57,9 @@ class Frames:
                 self._send(self._picture, FINE_ROWS)
 
     def _send(self, picture: Picture, rows: int) -> None:
-        # A window may be so small that nothing can be seen in it; and viser warns of a browser that has just left.
-        with suppress(GssegError, UserWarning):
+        # A window may be so small that nothing can be seen in it; and viser warns of a browser that has just left. An
+        # image for which memory runs out is left out: the next one may be drawn.
+        with suppress(GssegError, UserWarning, MemoryError):
             self._draw(picture, rows)
 
     def _draw(self, picture: Picture, rows: int) -> None:

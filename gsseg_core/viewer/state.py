@@ -45,7 +45,7 @@ class ViewerState:
         self._view_votes: ViewVotes | None = None
         self._view_votes_lock = threading.Lock()
         self.lock = threading.RLock()  # held by whoever needs that nothing of this changes meanwhile
-        self._recut()
+        self._parts = cut(model.labelling.labels, model.confidence)
 
     def seen(self) -> tuple[Picture, list[ClassRow]]:
         """Return the scene as it is to be seen now, and the list of classes."""
@@ -79,8 +79,7 @@ class ViewerState:
         """Show the level of the tree at a granularity: all of it, or only what lies inside one node."""
         tree = self._tree()
         with self.lock:
-            self.granularity = granularity
-            self._relabel()
+            self._relabel(granularity)
             model, shown = self.model, None if inside is None else {inside, *tree.inside(inside)}
             ids, model.hidden, model.removed = model.ids(), set(), set()
             if shown is not None:
@@ -130,19 +129,23 @@ class ViewerState:
     def correct(self, view: View) -> int:
         """Learn what was drawn in a picture of what is shown; return how many Gaussians that changed.
 
-        Raises `NoUsableViewsError` where nothing was drawn on any Gaussian.
+        Raises `NoUsableViewsError` where nothing was drawn on any Gaussian; where memory runs out, nothing is learnt.
         """
         with self.lock:
             before = self.model.labelling.labels
             self.corrections.add(view, self.model.shown())
-            self._relabel()
+            try:
+                self._relabel(self.granularity)
+            except MemoryError:
+                self.corrections.undo()
+                raise
             return int(np.count_nonzero(before != self.model.labelling.labels))
 
     def undo(self) -> bool:
         """Take the last correction back; return whether there was one."""
         with self.lock:
             undone = self.corrections.undo()
-            self._relabel()
+            self._relabel(self.granularity)
         return undone
 
     def replace(self, learnt: Labelling) -> None:
@@ -165,7 +168,7 @@ class ViewerState:
                 model.hidden, model.removed = ({ids.get(k, k) for k in off} for off in (model.hidden, model.removed))
             self.added_names = {ids.get(k, k): name for k, name in added.items() if ids.get(k, k) not in taken}
             self._learnt = learnt
-            self._relabel()
+            self._relabel(self.granularity)
 
     def selection(self, scene_format: str, collision: str | None = None) -> tuple[str, bytes]:
         """Write what is shown in a format of `gsseg_core.scene.scene_writers.SCENE_WRITERS`: a file name and its bytes.
@@ -207,14 +210,14 @@ class ViewerState:
         result = replace(result, tree=tree) if ids is None else result.with_ids(ids)
         return "segmentation.npz", _as_file(result.save, "segmentation.npz")
 
-    def _relabel(self) -> None:
-        self.objects, tree = self.corrections.apply(self._learnt, self.added_names), self.model.tree
-        self.model.relabel(at_level(self.objects, tree, self.granularity) if tree else self.objects)
-        self._recut()
+    def _relabel(self, granularity: float) -> None:
+        """Show what follows from the corrections, at a level; all of it, or nothing where memory runs out."""
+        objects, tree = self.corrections.apply(self._learnt, self.added_names), self.model.tree
+        shown = at_level(objects, tree, granularity) if tree else objects
+        self._parts = cut(shown.labels, shown.confidence())
+        self.objects, self.granularity = objects, granularity
+        self.model.relabel(shown)
         self.stale.set()
-
-    def _recut(self) -> None:
-        self._parts = cut(self.model.labelling.labels, self.model.confidence)
 
 
 def _as_file(write: Callable[[Path], Any], name: str) -> bytes:

@@ -112,19 +112,19 @@ class Viewer:
     def _keep_showing(self) -> None:
         while self.state.stale.wait() and not self._closing.is_set():
             self.state.stale.clear()
-            self._show()
+            with self.panel.answer.telling(None):
+                self._show()
 
     def _follow(self, source: LiveSource) -> None:
         while not self._closing.is_set():
             try:
                 update = source.wait(0.5)
-            except GssegError as error:
-                self.panel.show_live(str(error))
+                if update is not None:
+                    self.state.replace(update.labelling)
+                    self.panel.show_live(f"{update.num_views} views so far")
+            except (GssegError, MemoryError) as error:
+                self.panel.show_live(str(error) or "memory is not enough")
                 self._closing.wait(1.0)
-                continue
-            if update is not None:
-                self.state.replace(update.labelling)
-                self.panel.show_live(f"{update.num_views} views so far")
 
 
 def _pixel(camera: Camera, place: Sequence[float] | np.ndarray) -> tuple[float, float]:
