@@ -163,12 +163,12 @@ def store(tiles, blocks, first, kept, left_over) -> None:  # type: ignore[no-unt
         n = first[tile]
         for e in range(start[tile], start[tile + 1]):
             g = entries[e]
-            aim(table, g, left, top, lines)
+            aim(table, g, left, top, lines, 0)
             todo = np.int64(blocks[e])
             while todo:
                 b = first_bit(todo)
                 todo &= todo - 1
-                weight, _ = lift_block(rays, b, lines, table[g, WIDTH])
+                weight, _ = lift_block(rays, b, lines, 0, table[g, WIDTH])
                 store_row(record, 0, weight)
                 for c in range(TILE):
                     kept[n, c] = np.uint16(record[0, c] * np.float32(STEPS) + np.float32(0.5))

@@ -89,12 +89,12 @@ def _walk(
         u, v, inside = open_rays(tiles, tile, fresh)
         for e in range(tiles.start[tile], tiles.start[tile + 1]):
             g = tiles.entries[e]
-            reached = aim(tiles.table, g, u, v, lines) & inside
+            reached = aim(tiles.table, g, u, v, lines, 0) & inside
             while reached:
                 b = first_bit(reached)
                 reached &= reached - 1
                 fresh[b, :] = 1
-                weight, _ = blend_block(fresh, b, lines, tiles.table[g, WIDTH])
+                weight, _ = blend_block(fresh, b, lines, 0, tiles.table[g, WIDTH])
                 store_row(alpha, 0, weight)
                 for i in range(TILE):
                     r, c = in_tile(b, i)

@@ -49,5 +49,10 @@ def kernel(function: Callable[..., object] | None = None, **options: Any) -> Any
 
 
 def called_by_kernels(function: Callable[..., Any] | None = None, **options: Any) -> Any:
-    """Compile a function that only kernels call, never Python: without the code that Python would call it by."""
+    """Compile a function that only kernels call, never Python: without the code that Python would call it by.
+
+    It becomes part of each kernel. A call would count who holds its arrays, atomically: that may take as long as the
+    function itself.
+    """
+    options = {"forceinline": True, **options}
     return _njit(function, no_cpython_wrapper=True, no_cfunc_wrapper=True, **options)

@@ -97,36 +97,38 @@ def open_rays(tiles: Tiles, tile: int, rays: np.ndarray) -> tuple[Any, Any, int]
     return np.float32(left + 0.5), np.float32(top + 0.5), live
 
 
-@nb.njit(inline="always")
-def aim_next(tiles: Tiles, e: int, last: int, left: float, top: float, lines: np.ndarray) -> int:
-    """Aim the entry after e, before e is blended: its lines, (2, 2, 16) float32, go to number (e + 1) % 2.
+@called_by_kernels
+def aim_next(
+    table: np.ndarray, entries: np.ndarray, e: int, last: int, left: float, top: float, lines: np.ndarray
+) -> int:
+    """Aim the entry after e, before e is blended: pair (e + 1) % 2 of the lines, (2, 2, 16) float32, is its own.
 
     How many blocks an entry reaches, no processor guesses; where it is known a whole entry early, a wrong guess costs
     little. That saves a quarter of the lift.
     """
     if e + 1 == last:
         return 0
-    prefetch(tiles.table, tiles.entries[min(e + AHEAD, last - 1)])
-    return aim(tiles.table, tiles.entries[e + 1], left, top, lines[(e + 1) % 2])
+    prefetch(table, entries[min(e + AHEAD, last - 1)])
+    return aim(table, entries[e + 1], left, top, lines, (e + 1) % 2)
 
 
 @called_by_kernels(fastmath={"contract"}, error_model="numpy")
 def blend_tile(tiles: Tiles, tile: int) -> Records:
     """Make the records of one tile."""
-    first, last = tiles.start[tile], tiles.start[tile + 1]
+    first, last, table, entries = tiles.start[tile], tiles.start[tile + 1], tiles.table, tiles.entries
     # Sized for the worst case; pages that no record reaches are never touched.
     rays, weights = np.empty((TILE, TILE), np.float32), np.empty((TILE * (last - first), TILE), np.float32)
     blocks, ends = np.empty(TILE * (last - first), np.uint8), np.empty(last - first, np.int32)
     left, top, live = open_rays(tiles, tile, rays)
     lines = np.empty((2, 2, TILE), np.float32)
-    n, ahead = 0, aim_next(tiles, first - 1, last, left, top, lines)
+    n, ahead = 0, aim_next(table, entries, first - 1, last, left, top, lines)
     for e in range(first, last):
-        reached, own, wide = ahead & live, lines[e % 2], tiles.table[tiles.entries[e], WIDTH]
-        ahead = aim_next(tiles, e, last, left, top, lines)
+        reached, wide = ahead & live, table[entries[e], WIDTH]
+        ahead = aim_next(table, entries, e, last, left, top, lines)
         while reached:
             b = first_bit(reached)
             reached &= reached - 1
-            weight, bits = blend_block(rays, b, own, wide)
+            weight, bits = blend_block(rays, b, lines, e % 2, wide)
             store_row(weights, n, weight)
             blocks[n] = b
             n += bits > OPEN

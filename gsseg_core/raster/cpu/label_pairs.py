@@ -173,12 +173,12 @@ def _blend_likelihood(
         simd.prefetch(table, entries[later])
         simd.prefetch(likelihood, max(pair[later * label_count], 0))
         g, todo = entries[e], np.int64(blocks[e])
-        aim(table, g, left, top, lines)
+        aim(table, g, left, top, lines, 0)
         only = likelihood[pair[e * label_count]] if label_count == 1 else np.float32(0.0)
         while todo:
             b = simd.first_bit(todo)
             todo &= todo - 1
-            weight, _ = lift_block(rays, b, lines, table[g, WIDTH])
+            weight, _ = lift_block(rays, b, lines, 0, table[g, WIDTH])
             simd.store_row(weights, n, weight)
             n += 1
             total = simd.load_row(value, b)

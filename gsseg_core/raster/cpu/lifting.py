@@ -174,18 +174,18 @@ def _lift_tile(
             labelled[b] |= labels.lanes[span]
         if not labelled[b]:
             live &= ~(1 << b)
-    first, last = tiles.start[tile], tiles.start[tile + 1]
-    ahead = aim_next(tiles, first - 1, last, left, top, lines)
+    first, last, table, entries = tiles.start[tile], tiles.start[tile + 1], tiles.table, tiles.entries
+    ahead = aim_next(table, entries, first - 1, last, left, top, lines)
     for e in range(first, last):
-        blocks, own, wide = ahead & live, lines[e % 2], tiles.table[tiles.entries[e], WIDTH]
-        ahead = aim_next(tiles, e, last, left, top, lines)
+        blocks, wide = ahead & live, table[entries[e], WIDTH]
+        ahead = aim_next(table, entries, e, last, left, top, lines)
         hit = np.int64(0)
         # Lane by lane, as long as the label stays the same: most blocks have one label, and most entries too.
         current, lanewise = np.int64(-1), zero_row()
         while blocks:
             b = first_bit(blocks)
             blocks &= blocks - 1
-            weight, bits = lift_block(rays, b, own, wide)
+            weight, bits = lift_block(rays, b, lines, e % 2, wide)
             if not bits & OPEN:
                 live &= ~(1 << b)
             hit |= np.int64(bits >> LANES & labelled[b] > 0) << b

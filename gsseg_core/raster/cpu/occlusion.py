@@ -59,7 +59,7 @@ def _entry_depths(
 @kernel(parallel=True, fastmath=FAST, error_model="numpy")
 def _find_ends(tiles: Tiles, labelled: np.ndarray) -> np.ndarray:  # (H, W) bool
     """Find the entry of each tile at which its last labelled block ends, as `lifting` would, (T,) int64."""
-    ends = np.empty(tiles.rows * tiles.columns, np.int64)
+    ends, table, entries = np.empty(tiles.rows * tiles.columns, np.int64), tiles.table, tiles.entries
     stride = stride_of(tiles.rows)
     for turn in nb.prange(tiles.rows * tiles.columns):
         tile = tile_of_turn(turn, tiles.columns, tiles.rows, stride)
@@ -68,14 +68,14 @@ def _find_ends(tiles: Tiles, labelled: np.ndarray) -> np.ndarray:  # (H, W) bool
         live &= blocks_with(labelled, *corner_of(tiles, tile))
         ends[tile] = _GOES_ON if live else _NO_LABEL
         last = tiles.start[tile + 1]
-        ahead = aim_next(tiles, tiles.start[tile] - 1, last, left, top, lines)
+        ahead = aim_next(table, entries, tiles.start[tile] - 1, last, left, top, lines)
         for e in range(tiles.start[tile], last):
-            blocks, own, wide = ahead & live, lines[e % 2], tiles.table[tiles.entries[e], WIDTH]
-            ahead = aim_next(tiles, e, last, left, top, lines)
+            blocks, wide = ahead & live, table[entries[e], WIDTH]
+            ahead = aim_next(table, entries, e, last, left, top, lines)
             while blocks:
                 b = first_bit(blocks)
                 blocks &= blocks - 1
-                _, bits = lift_block(rays, b, own, wide)
+                _, bits = lift_block(rays, b, lines, e % 2, wide)
                 if not bits & OPEN:
                     live &= ~(1 << b)
             if not live:

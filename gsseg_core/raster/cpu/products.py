@@ -67,8 +67,7 @@ def render(tiles: Tiles, codes: CSRRows, rows: np.ndarray, channels: int) -> tup
     stride = stride_of(tiles.rows)
     for turn in nb.prange(tiles.rows * tiles.columns):
         tile = tile_of_turn(turn, tiles.columns, tiles.rows, stride)
-        others, rays = np.empty((TILE, 0, TILE), np.float32), np.empty((TILE, TILE), np.float32)
-        values, slots = _blend_codes(tiles, tile, codes, rows, channels, nothing_else, OPEN, 0, others, rays)
+        values, slots, _, rays = _blend_codes(tiles, tile, codes, rows, channels, nothing_else, OPEN, 0)
         columns, (left, top) = np.flatnonzero(slots >= 0), corner_of(tiles, tile)
         for r in range(min(TILE, tiles.height - top)):
             for c in range(min(TILE, tiles.width - left)):
@@ -106,10 +105,10 @@ def strongest(
         looked_at = blocks_with(wanted, left, top) if wanted.size else OPEN
         if not looked_at:
             continue
-        others, rays = np.zeros((TILE, beside.shape[1], TILE), np.float32), np.empty((TILE, TILE), np.float32)
         best, known = np.zeros((TILE, TILE), np.int32), np.empty((TILE, TILE), np.float32)
         ending = OPEN & ~_blocks_of_grid(first, step, left, top)
-        values, slots = _blend_codes(tiles, tile, codes, rows, channels, beside, looked_at, ending, others, rays)
+        blended = _blend_codes(tiles, tile, codes, rows, channels, beside, looked_at, ending)
+        values, slots, others, rays = blended
         columns = np.flatnonzero(slots >= 0)
         _compare(values, slots, columns, rays, background, best, known)
         _put(tiles, tile, others, rays, image, left_over)
@@ -181,8 +180,7 @@ def _compare(
 def _blend_codes(
     tiles: Tiles, tile: int, codes: CSRRows, rows: np.ndarray, channels: int, beside: np.ndarray,  # as `strongest`'s
     looked_at: int, ending: int,  # bits of blocks: of all that count; of those whose largest column alone is wanted
-    others: np.ndarray, rays: np.ndarray,  # (16, C, 16) in: zeros, by block; (16, 16) out
-) -> tuple[np.ndarray, np.ndarray]:  # fmt: skip
+) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:  # fmt: skip
     """Blend the codes of a tile, and others beside them; weights are used where they are made.
 
     Of hundreds of columns, a tile has a few: those get a slot, in the order in which they turn up. Returns the blended
@@ -190,22 +188,24 @@ def _blend_codes(
     int64, -1 where there is none. Blocks come first in the final transmittances, `rays`, too.
     """
     last, (indptr, indices, data) = tiles.start[tile + 1], codes
+    table, entries = tiles.table, tiles.entries
     # There is room for all, but memory is only what is written to.
     values, slots, count = np.empty((channels * TILE, TILE), np.float32), np.full(channels, -1), 0
     places = np.empty(channels, np.int64)  # where the slots of a Gaussian's columns begin
+    others, rays = np.zeros((TILE, beside.shape[1], TILE), np.float32), np.empty((TILE, TILE), np.float32)
     lines, turns = np.empty((2, 2, TILE), np.float32), np.zeros(TILE, np.int64)
     left, top, inside = open_rays(tiles, tile, rays)
     live = inside & looked_at
-    wanted, ahead = live, aim_next(tiles, tiles.start[tile] - 1, last, left, top, lines)
+    wanted, ahead = live, aim_next(table, entries, tiles.start[tile] - 1, last, left, top, lines)
     for e in range(tiles.start[tile], last):
-        g = tiles.entries[e]
-        reached, own, wide = ahead & live, lines[e % 2], tiles.table[g, WIDTH]
+        g = entries[e]
+        reached, wide = ahead & live, table[g, WIDTH]
         # Rows are anywhere in memory: they are asked for before they are needed, while they are.
-        prefetch(beside, tiles.entries[min(e + AHEAD, last - 1)])
+        prefetch(beside, entries[min(e + AHEAD, last - 1)])
         if wanted:
-            prefetch(rows, tiles.entries[min(e + 3 * AHEAD, last - 1)])
-            prefetch(indptr, rows[tiles.entries[min(e + 2 * AHEAD, last - 1)]])
-            later = indptr[rows[tiles.entries[min(e + AHEAD, last - 1)]]]
+            prefetch(rows, entries[min(e + 3 * AHEAD, last - 1)])
+            prefetch(indptr, rows[entries[min(e + 2 * AHEAD, last - 1)]])
+            later = indptr[rows[entries[min(e + AHEAD, last - 1)]]]
             prefetch(indices, later)
             prefetch(data, later)
         first, end = (indptr[rows[g]], indptr[rows[g] + 1]) if wanted & reached else (0, 0)
@@ -215,11 +215,11 @@ def _blend_codes(
                 slots[indices[z]] = count
                 count += 1
             places[z - first] = slots[indices[z]] * TILE
-        ahead = aim_next(tiles, e, last, left, top, lines)
+        ahead = aim_next(table, entries, e, last, left, top, lines)
         while reached:
             b = first_bit(reached)
             reached &= reached - 1
-            weight, bits = blend_block(rays, b, own, wide)
+            weight, bits = blend_block(rays, b, lines, e % 2, wide)
             if wanted >> b & 1:
                 for z in range(first, end):
                     row = places[z - first] + b
@@ -237,7 +237,7 @@ def _blend_codes(
                 live &= ~(1 << b)
         if not live:
             break
-    return values, slots
+    return values, slots, others, rays
 
 
 @kernel(parallel=True, fastmath={"contract"}, error_model="numpy")
@@ -246,7 +246,7 @@ def render_few(tiles: Tiles, codes: np.ndarray, wanted: np.ndarray) -> tuple[np.
 
     Blocks of 4 x 4 pixels none of which is `wanted`, (H, W) bool or (0, 0) for all, are not looked at.
     """
-    channels = codes.shape[1]
+    channels, table, entries = codes.shape[1], tiles.table, tiles.entries
     out, left_over = _blank(tiles, channels)
     stride = stride_of(tiles.rows)
     for turn in nb.prange(tiles.rows * tiles.columns):
@@ -256,16 +256,16 @@ def render_few(tiles: Tiles, codes: np.ndarray, wanted: np.ndarray) -> tuple[np.
         values, corner = np.zeros((TILE, channels, TILE), np.float32), corner_of(tiles, tile)
         left, top, live = open_rays(tiles, tile, rays)
         live &= blocks_with(wanted, corner[0], corner[1]) if wanted.size else OPEN
-        ahead = aim_next(tiles, tiles.start[tile] - 1, last, left, top, lines)
+        ahead = aim_next(table, entries, tiles.start[tile] - 1, last, left, top, lines)
         for e in range(tiles.start[tile], last):
-            g = tiles.entries[e]
-            prefetch(codes, tiles.entries[min(e + AHEAD, last - 1)])
-            reached, own, wide = ahead & live, lines[e % 2], tiles.table[g, WIDTH]
-            ahead = aim_next(tiles, e, last, left, top, lines)
+            g = entries[e]
+            prefetch(codes, entries[min(e + AHEAD, last - 1)])
+            reached, wide = ahead & live, table[g, WIDTH]
+            ahead = aim_next(table, entries, e, last, left, top, lines)
             while reached:
                 b = first_bit(reached)
                 reached &= reached - 1
-                weight, bits = blend_block(rays, b, own, wide)
+                weight, bits = blend_block(rays, b, lines, e % 2, wide)
                 for k in range(b * channels, (b + 1) * channels):
                     store_row(values, k, add_scaled(load_row(values, k), weight, codes[g, k - b * channels]))
                 if not bits & OPEN:

@@ -82,13 +82,13 @@ def reasons_to_go(
             label, z = labels[g], depths[g]
             if label == tile_only or z > tile_farthest:
                 continue
-            reached, total = aim(table, g, left, top, lines) & inside, np.float32(0)
+            reached, total = aim(table, g, left, top, lines, 0) & inside, np.float32(0)
             while reached:
                 b = first_bit(reached)
                 reached &= reached - 1
                 if only[b] == label or only[b] == _UNKNOWN or z > farthest[b]:
                     continue
-                store_row(alpha, 0, alpha_of(b, lines, table[g, WIDTH]))
+                store_row(alpha, 0, alpha_of(b, lines, 0, table[g, WIDTH]))
                 for i in range(TILE):
                     outside = seen[b, i] != label and seen[b, i] >= 0 and z <= limit[b, i]
                     total += alpha[0, i] if outside else np.float32(0)
@@ -120,7 +120,7 @@ def reasons_to_stay(
             g = entries[e]
             slot = slots[labels[g]]
             if asked[g] and live[slot] != shows[slot]:
-                live[slot] |= aim(table, g, left, top, lines[0]) & shows[slot]
+                live[slot] |= aim(table, g, left, top, lines, 0) & shows[slot]
         members, n = np.empty(start[tile + 1] - start[tile] + 1, np.int32), 0
         for e in range(start[tile], start[tile + 1]):  # without a branch: who is not wanted is overwritten
             members[n] = entries[e]
@@ -129,18 +129,18 @@ def reasons_to_stay(
             continue
         through = np.ones((count * TILE, TILE), np.float32)  # T_k, block by block
         # Aimed one early, as in `aim_next`.
-        ahead = aim(table, members[0], left, top, lines[0])
+        ahead = aim(table, members[0], left, top, lines, 0)
         for m in range(n):
-            g, its = members[m], lines[m % 2]
+            g = members[m]
             slot = slots[labels[g]]
             reached = ahead & live[slot]
             if m + 1 < n and live[slots[labels[members[m + 1]]]]:
-                ahead = aim(table, members[m + 1], left, top, lines[(m + 1) % 2])
+                ahead = aim(table, members[m + 1], left, top, lines, (m + 1) % 2)
             while reached:
                 b = first_bit(reached)
                 reached &= reached - 1
                 before = load_row(through, slot * TILE + b)
-                share = add_scaled(zero_row(), alpha_of(b, its, table[g, WIDTH]), -kept[g])
+                share = add_scaled(zero_row(), alpha_of(b, lines, m % 2, table[g, WIDTH]), -kept[g])
                 after = add_product(before, before, share)
                 store_row(through, slot * TILE + b, after)
                 if sum_row(after) < T_MIN:
@@ -151,11 +151,12 @@ def reasons_to_stay(
             g = entries[e]
             slot, total = slots[labels[g]], zero_row()
             if asked[g] and live[slot]:
-                reached = aim(table, g, left, top, lines[0]) & live[slot]
+                reached = aim(table, g, left, top, lines, 0) & live[slot]
                 while reached:
                     b = first_bit(reached)
                     reached &= reached - 1
-                    total = add_product(total, alpha_of(b, lines[0], table[g, WIDTH]), load_row(need, slot * TILE + b))
+                    alpha = alpha_of(b, lines, 0, table[g, WIDTH])
+                    total = add_product(total, alpha, load_row(need, slot * TILE + b))
                 stay[e] = sum_row(total)
 
 

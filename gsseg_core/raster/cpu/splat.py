@@ -44,20 +44,26 @@ def _projected(build: Builder, position: int) -> Callable[[int], Any]:
     return column
 
 
-def _four_of(build: Builder, position: int, i: int, block: Any) -> Any:
-    """Entries of row i that belong to the four rows of a block, each four times."""
+def _row_of_lines(build: Builder, pair: Any, i: int) -> Any:
+    """Find the number of row i of a pair of lines among the rows of all pairs."""
+    return build.llvm.add(build.llvm.mul(pair, ir.Constant(pair.type, 2)), ir.Constant(pair.type, i))
+
+
+def _four_of(build: Builder, position: int, pair: Any, i: int, block: Any) -> Any:
+    """Entries of row i of a pair of lines that belong to the four rows of a block, each four times."""
     first = build.llvm.and_(block, ir.Constant(block.type, LANES - SIDE))
-    place = build.llvm.add(first, ir.Constant(block.type, i * LANES))
+    row = build.llvm.mul(_row_of_lines(build, pair, i), ir.Constant(pair.type, LANES))
+    place = build.llvm.add(first, row)
     address = build.llvm.bitcast(build.element(position, place), ir.PointerType(_FOUR))
     four = build.llvm.load(address, align=4, typ=_FOUR)
     return build.llvm.shuffle_vector(four, ir.Constant(_FOUR, ir.Undefined), _EACH_FOUR_TIMES)
 
 
 def _power(build: Builder, first: int) -> Any:
-    """Log2 of alpha in a block, before it is clipped; arguments from `first` on: block, lines and width."""
-    block, _, width = build.arguments[first : first + 3]
-    offset = build.llvm.fsub(_pixel_columns(build, block), _four_of(build, first + 1, 0, block))
-    peak, wide = _four_of(build, first + 1, 1, block), build.broadcast(build.llvm.fneg(width))
+    """Log2 of alpha in a block, before it is clipped; arguments from `first` on: block, lines, pair and width."""
+    block, _, pair, width = build.arguments[first : first + 4]
+    offset = build.llvm.fsub(_pixel_columns(build, block), _four_of(build, first + 1, pair, 0, block))
+    peak, wide = _four_of(build, first + 1, pair, 1, block), build.broadcast(build.llvm.fneg(width))
     return build.fma(wide, build.llvm.fmul(offset, offset), peak)
 
 
@@ -75,20 +81,22 @@ def _pixel_columns(build: Builder, block: Any) -> Any:
     return build.llvm.load(place, align=4, typ=ROW)
 
 
-@operation(types.int64, None, types.intp, types.float32, types.float32, None)
-def aim(build: Builder, table: Any, g: Any, left: Any, top: Any, lines: Any) -> Any:
+@operation(types.int64, None, types.intp, types.float32, types.float32, None, types.int64)
+def aim(build: Builder, table: Any, g: Any, left: Any, top: Any, lines: Any, pair: Any) -> Any:
     """Tell which blocks of a tile a Gaussian reaches: bit b is set if alpha is at least 1/255 at some pixel of block b.
 
-    The tile's first pixel has its centre at (left, top). For each row of the tile, lines[0] gets the column of the
-    largest alpha, and lines[1] what log2 of alpha would be there.
+    The tile's first pixel has its centre at (left, top). For each row of the tile, the first row of that pair of
+    lines, (P, 2, 16) float32, gets the column of the largest alpha, and the second one what log2 of alpha would be
+    there. A view of the pair would do, too, but kernels count who holds a view, and an atomic count takes as long as a
+    block.
     """
     llvm, column = build.llvm, _projected(build, 0)
     dy = llvm.fsub(_ROWS, build.broadcast(llvm.fsub(column(V), top)))
     x = build.fma(build.broadcast(column(SHEAR)), dy, build.broadcast(llvm.fsub(column(U), left)))
     high, wide = build.broadcast(llvm.fneg(column(HEIGHT))), build.broadcast(llvm.fneg(column(WIDTH)))
     peak = build.fma(high, llvm.fmul(dy, dy), build.broadcast(column(LOG_OPACITY)))
-    build.store(x, build.address(4, ir.Constant(I64, 0)))
-    build.store(peak, build.address(4, ir.Constant(I64, 1)))
+    build.store(x, build.address(4, _row_of_lines(build, pair, 0)))
+    build.store(peak, build.address(4, _row_of_lines(build, pair, 1)))
     # In each row, no pixel of a block is nearer to the peak than this one, and its alpha is computed as `blend_block`
     # does: so the bits say exactly what will be found there.
     whole, bits = build.rint(x), ir.Constant(I64, 0)
@@ -111,8 +119,8 @@ def aim(build: Builder, table: Any, g: Any, left: Any, top: Any, lines: Any) -> 
 _FOUND: Any = types.Tuple((row_type, types.int64))  # type: ignore[no-untyped-call]
 
 
-@operation(_FOUND, None, None, None, types.float32)
-def blend_block(build: Builder, rays: Any, b: Any, lines: Any, wide: Any) -> Any:
+@operation(_FOUND, None, types.int64, None, types.int64, types.float32)
+def blend_block(build: Builder, rays: Any, b: Any, lines: Any, pair: Any, wide: Any) -> Any:
     """Blend one Gaussian into block b of the rays.
 
     In column c of row r its log2 of alpha is peak - wide * (c - x)^2, with x and peak of row r from `aim`; below that
@@ -122,8 +130,8 @@ def blend_block(build: Builder, rays: Any, b: Any, lines: Any, wide: Any) -> Any
     return _blended(build, lifts=False)
 
 
-@operation(_FOUND, None, None, None, types.float32)
-def lift_block(build: Builder, rays: Any, b: Any, lines: Any, wide: Any) -> Any:
+@operation(_FOUND, None, types.int64, None, types.int64, types.float32)
+def lift_block(build: Builder, rays: Any, b: Any, lines: Any, pair: Any, wide: Any) -> Any:
     """Blend one Gaussian into block b of rays that lift a mask: as `blend_block`, but they end as `T_LIFTED` says."""
     return _blended(build, lifts=True)
 
@@ -178,8 +186,8 @@ def _taken(build: Builder, power: Any, lifts: bool) -> Any:
     return build.context.make_tuple(llvm, build.signature.return_type, [weight, bits])
 
 
-@operation(row_type, None, None, types.float32)
-def alpha_of(build: Builder, b: Any, lines: Any, wide: Any) -> Any:
+@operation(row_type, types.int64, None, types.int64, types.float32)
+def alpha_of(build: Builder, b: Any, lines: Any, pair: Any, wide: Any) -> Any:
     """Alpha of one Gaussian in block b, as `blend_block` has it, whatever lies in front."""
     power = _power(build, 0)
     found = build.llvm.fcmp_ordered(">=", power, constant(LOG_ALPHA_MIN))
