@@ -107,11 +107,12 @@ define check-ros
 	{ echo 'compiling the ROS messages needs gcc, g++ and cmake' >&2; exit 1; }
 endef
 
-# setuptools first, so that the build uses the pinned one too.
+# pip and setuptools first: the pinned pip finds what there is in a third of the processor time that the one of Python 3.11
+# takes, and the build uses the pinned setuptools, too.
 $(READY): $(INSTALLED) pyproject.toml constraints.txt
 	$(check-python)
 	$(PYTHON) -m venv $(VENV)
-	$(BIN)/python -m pip install --quiet --constraint constraints.txt setuptools
+	$(BIN)/python -m pip install --quiet --constraint constraints.txt pip setuptools
 	$(BIN)/python -m pip install --quiet --constraint constraints.txt --no-build-isolation --editable '.[dev]'
 	touch $@
 
@@ -140,6 +141,7 @@ $(COLCON_READY): .ci/colcon-requirements.txt .ci/ubuntu-24.04.txt constraints.tx
 	$(PYTHON) -m venv $(COLCON_VENV)
 	sed -n 's/^\([a-z0-9]*==\).*/^\1/p' .ci/ubuntu-24.04.txt | grep -v -f - constraints.txt | \
 		cat - .ci/ubuntu-24.04.txt > $(COLCON_VENV)/constraints.txt
+	$(COLCON_VENV)/bin/python -m pip install --quiet --constraint constraints.txt pip
 	$(COLCON_VENV)/bin/python -m pip install --quiet --constraint $(COLCON_VENV)/constraints.txt \
 		-r .ci/colcon-requirements.txt
 	touch $@
