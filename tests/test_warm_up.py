@@ -120,6 +120,18 @@ assert pick(scene, camera.center, scene.means[0] - camera.center, state.model.sh
 state.view_votes()
 state.segmentation_npz()
 state.selection("ply")""",
+    "a camera whose matrices lie by columns": """
+from dataclasses import replace
+import numpy as np
+from gsseg_core.data.dataset import Dataset
+from gsseg_core.raster.backends import make_operator
+from gsseg_core.scene.gaussian_scene import GaussianScene
+camera = Dataset({data!r}).views("train")[0].camera
+turned = replace(camera, world_to_camera=np.asfortranarray(camera.world_to_camera), K=np.asfortranarray(camera.K))
+assert turned.world_to_camera.flags.f_contiguous
+colors = (scene := GaussianScene.load({scene!r})).colors(camera.center)
+there, here = (make_operator(scene, one).render(colors) for one in (turned, camera))
+assert all(np.array_equal(*pair) for pair in zip(there, here))""",
     "move outlines": """
 import numpy as np
 from gsseg_core.learn.em.boundary_alignment import align_boundaries

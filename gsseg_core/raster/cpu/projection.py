@@ -65,12 +65,12 @@ class Pinhole(NamedTuple):
 
     @classmethod
     def of(cls, camera: Camera) -> Pinhole:
-        """Take what is needed of a camera."""
+        """Take what is needed of a camera; matrices that lie by columns would have every kernel compiled for them."""
         width, height = float(camera.width), float(camera.height)
         fx, fy, cx, cy = camera.K[[0, 1, 0, 1], [0, 1, 2, 2]].tolist()
         across, down = FRUSTUM_MARGIN * 0.5 * width / fx, FRUSTUM_MARGIN * 0.5 * height / fy
         return cls(
-            camera.world_to_camera, camera.K, width, height,
+            np.ascontiguousarray(camera.world_to_camera), np.ascontiguousarray(camera.K), width, height,
             -cx / fx - across, (width - cx) / fx + across, -cy / fy - down, (height - cy) / fy + down,
         )  # fmt: skip
 
