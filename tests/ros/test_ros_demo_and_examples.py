@@ -30,6 +30,20 @@ from gsseg_ros.client import SegmentationClient
 EXAMPLES = sorted((REPOSITORY / "examples").glob("*.py"))
 PYTHONPATH = {"PYTHONPATH": str(REPOSITORY), "PYTHONUNBUFFERED": "1"}
 
+BUILT_BEFORE = """
+import pickle
+import shutil
+import sys
+from dataclasses import replace
+from pathlib import Path
+from gsseg_ros import demo
+before = Path(sys.argv.pop(1))
+built = pickle.loads((before / "built.pickle").read_bytes())
+demo.build_demo = lambda folder, seed: replace(built, root=shutil.copytree(before / "scene", folder))
+sys.exit(demo.main())
+"""
+"""The demo's program, with the scene that `demo_run` has built: that is half the work of one that is ended early."""
+
 
 def processes_with(text: str) -> list[int]:
     """Process ids whose command line holds a text."""
@@ -46,10 +60,11 @@ def processes_with(text: str) -> list[int]:
 class Demo:
     """A demo under way, writing to a folder of its own."""
 
-    def __init__(self, out: Path, *arguments: str) -> None:
+    def __init__(self, out: Path, *arguments: str, built: Path | None = None) -> None:
         self.out = out
+        program = ["-m", "gsseg_ros.demo"] if built is None else ["-c", BUILT_BEFORE, str(built)]
         self.process = subprocess.Popen(
-            [sys.executable, "-m", "gsseg_ros.demo", "--out", str(out), "--quiet", *arguments],
+            [sys.executable, *program, "--out", str(out), "--quiet", *arguments],
             cwd=REPOSITORY, env={**os.environ, **PYTHONPATH}, text=True, stdout=subprocess.PIPE,
             stderr=subprocess.PIPE,
         )  # fmt: skip
@@ -104,8 +119,10 @@ def test_the_demo_segments_its_scene_well_and_shows_it(demo_out: Path) -> None:
 
 
 @pytest.mark.parametrize(("number", "code"), [(signal.SIGINT, 130), (signal.SIGTERM, 128 + signal.SIGTERM)])
-def test_no_node_outlives_a_demo_that_is_ended_early(demo_out: Path, number: signal.Signals, code: int) -> None:
-    demo = Demo(demo_out, "--rate", "0.1")
+def test_no_node_outlives_a_demo_that_is_ended_early(
+    demo_out: Path, demo_run: Path, number: signal.Signals, code: int
+) -> None:
+    demo = Demo(demo_out, "--rate", "0.1", built=demo_run)
     demo.wait_for_log("replay_node", "replaying 30 views")
     assert len(demo.children) >= 2
     demo.process.send_signal(number)
@@ -116,8 +133,8 @@ def test_no_node_outlives_a_demo_that_is_ended_early(demo_out: Path, number: sig
 
 
 @pytest.mark.parametrize("module", ["segment_node", "replay_node"])
-def test_a_node_that_dies_ends_the_demo_with_its_log_named(demo_out: Path, module: str) -> None:
-    demo = Demo(demo_out, "--rate", "0.1")
+def test_a_node_that_dies_ends_the_demo_with_its_log_named(demo_out: Path, demo_run: Path, module: str) -> None:
+    demo = Demo(demo_out, "--rate", "0.1", built=demo_run)
     demo.wait_for_log("replay_node", "replaying 30 views")
     (number,) = [n for n in demo.children if module in Path(f"/proc/{n}/cmdline").read_text()]
     os.kill(number, signal.SIGKILL)
