@@ -1,9 +1,9 @@
-"""Nodes that begin as copies of a process that has imported what they need of the core: a third of their start is that.
+"""Nodes that begin as copies of a process that has what they need of the core: two thirds of their start are that.
 
-This file is the program of that process; `Template` starts it, once for the tests of a worker, and asks it for nodes.
-Nothing of ROS is imported before a process is copied, since that starts threads, which copies lack; then all goes on as
-in `python -m`. Nodes that people start, by the demo, launch files, `ros2 run` and the pages of the documentation, begin
-in the tests as theirs do.
+It has imported modules and loaded kernels. This file is the program of that process; `Template` starts it, once for the
+tests of a worker, and asks it for nodes. Nothing of ROS is imported and no kernel runs before a process is copied,
+since that starts threads, which copies lack; then all goes on as in `python -m`. Nodes that people start, by the demo,
+launch files, `ros2 run` and the pages of the documentation, begin in the tests as theirs do.
 """
 
 from __future__ import annotations
@@ -143,13 +143,31 @@ def _serve(asked: socket.socket) -> tuple[str, list[str]]:
                 selector.register(file, selectors.EVENT_READ)
 
 
+def _load_kernels() -> None:
+    """Load all kernels that are kept of the modules that are imported, as their first calls would."""
+    from numba.core.caching import FunctionCache
+    from numba.core.dispatcher import Dispatcher
+
+    importlib.import_module("gsseg_core.raster.cpu.tile_operator")  # The first view would.
+    for kernel in [thing for thing in gc.get_objects() if isinstance(thing, Dispatcher)]:
+        if isinstance(cache := kernel._cache, FunctionCache):
+            for key in cache._cache_file._load_index():
+                if key == cache._index_key(key[0], kernel.targetctx.codegen()):
+                    kernel.compile(key[0])
+
+
 if __name__ == "__main__":
     sys.path[0] = str(REPOSITORY)
     for file in sorted(REPOSITORY.glob("gsseg_ros/node/*.py")):
         for module in re.findall(r"^from (gsseg_core\S*) import", file.read_text(), re.MULTILINE):
             importlib.import_module(module)
-    assert len(os.listdir("/proc/self/task")) == 1, "what is imported starts threads"
+    _load_kernels()
+    assert len(os.listdir("/proc/self/task")) == 1, "what is imported or loaded starts threads"
     gc.freeze()
+    # numba refuses to run kernels in children of a process that has loaded OpenMP: they would lack its threads. There
+    # are none yet, but only of grandchildren does numba not think so.
+    if child := os.fork():
+        sys.exit(os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]))
     module, arguments = _serve(socket.socket(fileno=int(sys.argv[1])))
     sys.argv[1:] = arguments
     runpy.run_module(module, run_name="__main__", alter_sys=True)
