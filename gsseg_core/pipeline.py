@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Mapping
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import ExitStack
 from dataclasses import replace
 from functools import partial
@@ -38,7 +39,7 @@ from gsseg_core.scene.gaussian_scene import GaussianScene
 from gsseg_core.scene.scene_writers import DEFAULT as DEFAULT_FORMAT
 from gsseg_core.segmentation import Segmentation
 from gsseg_core.spatial.neighbour_graph import graph_of
-from gsseg_core.spatial.row_order import in_curve_order
+from gsseg_core.spatial.row_order import along_curve, in_curve_order
 
 if TYPE_CHECKING:
     from distributed import Client
@@ -131,10 +132,12 @@ def segment(
                 scene, dataset = GaussianScene.load(scene_path), Dataset(data, labels, label_map=label_map)
                 settings = replace(settings, ids=_ids(dataset, settings))
                 settings.check()
-            with watch.stage("place cameras"):
+            with watch.stage("place cameras"), ThreadPoolExecutor(1, "gsseg-order") as beside:
+                known = beside.submit(_look_over, scene, ordered=client is None)
                 placed = place(
                     scene, dataset, align=align, check=True, dataparser=dataparser, device=device, progress=progress
                 )
+                known.result()
             with watch.stage("load"):
                 # Workers find the scene in files of their own, in the order that it has there.
                 inputs = _inputs(scene, placed, settings, ordered=client is None)
@@ -186,6 +189,13 @@ def _connect(scheduler: str | None, workers: ExitStack) -> Client | None:
     from gsseg_core.learn.distributed.dask_cluster import connected
 
     return workers.enter_context(connected(scheduler))
+
+
+def _look_over(scene: GaussianScene, *, ordered: bool) -> None:
+    """Have a scene find, by one thread, what `_inputs` asks it for: its digest and its order, which it keeps."""
+    _ = scene.digest
+    if ordered:
+        along_curve(scene)
 
 
 def _inputs(scene: GaussianScene, placed: Placed, settings: RunSettings, *, ordered: bool) -> Inputs:
