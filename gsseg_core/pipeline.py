@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import os
 from collections.abc import Mapping
-from concurrent.futures import ThreadPoolExecutor
 from contextlib import ExitStack
 from dataclasses import replace
 from functools import partial
@@ -38,6 +37,7 @@ from gsseg_core.report.run_files import Assessment, Inputs, write_run
 from gsseg_core.scene.gaussian_scene import GaussianScene
 from gsseg_core.scene.scene_writers import DEFAULT as DEFAULT_FORMAT
 from gsseg_core.segmentation import Segmentation
+from gsseg_core.several_at_once import beside
 from gsseg_core.spatial.neighbour_graph import graph_of
 from gsseg_core.spatial.row_order import along_curve, in_curve_order
 
@@ -132,12 +132,10 @@ def segment(
                 scene, dataset = GaussianScene.load(scene_path), Dataset(data, labels, label_map=label_map)
                 settings = replace(settings, ids=_ids(dataset, settings))
                 settings.check()
-            with watch.stage("place cameras"), ThreadPoolExecutor(1, "gsseg-order") as beside:
-                known = beside.submit(_look_over, scene, ordered=client is None)
+            with watch.stage("place cameras"), beside(partial(_look_over, scene, ordered=client is None)):
                 placed = place(
                     scene, dataset, align=align, check=True, dataparser=dataparser, device=device, progress=progress
                 )
-                known.result()
             with watch.stage("load"):
                 # Workers find the scene in files of their own, in the order that it has there.
                 inputs = _inputs(scene, placed, settings, ordered=client is None)

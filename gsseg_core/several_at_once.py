@@ -75,15 +75,22 @@ def each_with_made(
 
 
 @contextmanager
+def beside(work: Callable[[], object]) -> Iterator[None]:
+    """Do some work in a thread of its own beside the body, and end with it."""
+    with ThreadPoolExecutor(1, "gsseg-beside") as other:
+        done = other.submit(work)
+        yield
+        done.result()
+
+
+@contextmanager
 def meanwhile(work: Callable[[], object], device: str) -> Iterator[None]:
     """Do some work on the CPU while the body has a GPU at work, and end with it; without a GPU, leave it undone."""
     if device == "cpu" or not kernels_run_beside_each_other():
         yield
         return
-    with ThreadPoolExecutor(1, "gsseg-beside") as beside:
-        done = beside.submit(work)
+    with beside(work):
         yield
-        done.result()
 
 
 def _with_threads(few: int, made: R, usual: int) -> Generator[R, None, None]:

@@ -129,14 +129,14 @@ class ViewerState:
     def correct(self, view: View) -> int:
         """Learn what was drawn in a picture of what is shown; return how many Gaussians that changed.
 
-        Raises `NoUsableViewsError` where nothing was drawn on any Gaussian; where memory runs out, nothing is learnt.
+        Raises `NoUsableViewsError` where nothing was drawn on any Gaussian; after any error, nothing is learnt.
         """
         with self.lock:
             before = self.model.labelling.labels
             self.corrections.add(view, self.model.shown())
             try:
                 self._relabel(self.granularity)
-            except MemoryError:
+            except Exception:
                 self.corrections.undo()
                 raise
             return int(np.count_nonzero(before != self.model.labelling.labels))

@@ -107,8 +107,7 @@ def strongest(
             continue
         best, known = np.zeros((TILE, TILE), np.int32), np.empty((TILE, TILE), np.float32)
         ending = OPEN & ~_blocks_of_grid(first, step, left, top)
-        blended = _blend_codes(tiles, tile, codes, rows, channels, beside, looked_at, ending)
-        values, slots, others, rays = blended
+        values, slots, others, rays = _blend_codes(tiles, tile, codes, rows, channels, beside, looked_at, ending)
         columns = np.flatnonzero(slots >= 0)
         _compare(values, slots, columns, rays, background, best, known)
         _put(tiles, tile, others, rays, image, left_over)
@@ -184,8 +183,9 @@ def _blend_codes(
     """Blend the codes of a tile, and others beside them; weights are used where they are made.
 
     Of hundreds of columns, a tile has a few: those get a slot, in the order in which they turn up. Returns the blended
-    codes, (16 K, 16) float32, of which slot s has rows 16 s to 16 s + 15, by block; and the slot of each column, (K,)
-    int64, -1 where there is none. Blocks come first in the final transmittances, `rays`, too.
+    codes, (16 K, 16) float32, of which slot s has rows 16 s to 16 s + 15, by block; the slot of each column, (K,)
+    int64, -1 where there is none; and by block, what is `beside` them, (16, C, 16) float32, and the final
+    transmittances, (16, 16) float32.
     """
     last, (indptr, indices, data) = tiles.start[tile + 1], codes
     table, entries = tiles.table, tiles.entries

@@ -172,7 +172,7 @@ def _list(
     return needed
 
 
-@called_by_kernels(error_model="numpy", forceinline=False)  # for few
+@called_by_kernels(error_model="numpy", forceinline=False)  # which few Gaussians need
 def _list_many(
     splat: np.ndarray, low: int, high: int, columns: int,  # (8,) a row of the table; rows of tiles, high excluded
     touched: np.ndarray, n: int,  # (R,) int32 out, from n on, as far as they fit
