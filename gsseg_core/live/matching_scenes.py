@@ -43,10 +43,9 @@ def match_scenes(before: LivingScene, scene: GaussianScene, tolerance: float = 0
     origin = _nearest(before.scene.means, scene.means, tolerance)
     after = LivingScene.of(scene)
     if before.scene.ids is not None:
-        # The ids of those that match go on; others get new ones, behind the largest.
         new = np.flatnonzero(origin < 0)
-        ids = before.ids[origin]
-        ids[new] = before.ids.max() + 1 + np.arange(len(new))
+        ids = before.ids[origin]  # Those of what matches go on.
+        ids[new] = _free_ids(before.ids, len(new))
         after = LivingScene.numbered(scene, ids)
     return Matching(after, origin, "position")
 
@@ -84,6 +83,13 @@ def places_in_saved(saved: LivingScene, first: LivingScene, now: LivingScene) ->
             "scene has one; expected the scene that it was saved for, or a file of it with ids"
         )
     return origin
+
+
+def _free_ids(taken: np.ndarray, count: int) -> np.ndarray:  # (N,) int64
+    """Find so many ids that are not taken: those behind the largest, or, where int64 ends before, the lowest."""
+    if count <= np.iinfo(np.int64).max - taken.max():
+        return taken.max() + 1 + np.arange(count)
+    return np.setdiff1d(np.arange(len(taken) + count), taken)[:count]
 
 
 def _nearest(before: np.ndarray, after: np.ndarray, tolerance: float) -> np.ndarray:  # (N, 3), (N', 3)

@@ -152,6 +152,17 @@ def test_a_file_in_another_order_takes_the_votes_to_their_gaussians() -> None:
     np.testing.assert_array_equal(votes(shuffled), before[order])
 
 
+def test_what_a_file_without_ids_adds_gets_free_ids_also_where_those_there_reach_the_end_of_int64() -> None:
+    ids = np.arange(len(SCENE))
+    ids[-1] = np.iinfo(np.int64).max
+    growing, room = LivingSession(LivingScene.numbered(SCENE, ids).scene, NAMES), other_room((0, 0, 50)).added
+    assert room is not None
+    parts = [[getattr(one, name) for one in (SCENE, room)] for name in ARRAYS]
+    changed = growing.replace_scene(GaussianScene.from_arrays(*map(np.concatenate, parts)))
+    assert (changed.num_carried, changed.num_added, changed.matched_by) == (len(SCENE), len(SCENE), "position")
+    np.testing.assert_array_equal(growing.living.ids, [*ids, *range(len(SCENE) - 1, 2 * len(SCENE) - 1)])
+
+
 @pytest.mark.parametrize("with_ids", [False, True])
 def test_a_state_saved_before_a_file_in_another_order_loads_after_it_to_its_gaussians(
     tmp_path: Path, with_ids: bool
