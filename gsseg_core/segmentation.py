@@ -21,7 +21,7 @@ from gsseg_core.data.segmentation_file import UNOBSERVED as UNOBSERVED
 from gsseg_core.data.view import spread
 from gsseg_core.errors import SettingsError, StateMismatchError
 from gsseg_core.files.limits import MAX_LABEL
-from gsseg_core.files.npz_files import WithZeros, check_evidence, check_shares, check_temperature, write_npz
+from gsseg_core.files.npz_files import arrays_of_rows, check_evidence, check_shares, check_temperature, write_npz
 from gsseg_core.files.run_folder import settle
 from gsseg_core.learn.temperature import tempered, tempered_rows
 from gsseg_core.raster.view_operator import ViewOperator
@@ -348,7 +348,7 @@ class Segmentation:
                   "temperature": self.temperature, **({} if run is None else {"run": run})}  # fmt: skip
         names, k = ("labels", "class_ids", "confidence", "clustered"), len(self.class_names)
         arrays: dict[str, Any] = {name: getattr(self, name) for name in names}
-        arrays |= {"probabilities": WithZeros(self.shares, k), "learnt": WithZeros(self.learnt, k)}
+        arrays |= arrays_of_rows("probabilities", self.shares, k) | arrays_of_rows("learnt", self.learnt, k)
         if self.tree is not None:
             header["granularity"] = self.tree.level
             arrays |= self.tree.arrays()

@@ -7,8 +7,9 @@ from typing import Any
 
 import numpy as np
 
+from gsseg_core.csr_rows import CSRRows
 from gsseg_core.data.object_tree import ObjectTree
-from gsseg_core.files.npz_files import UnfitError, check_shares, class_names_of, open_npz, temperature_of
+from gsseg_core.files.npz_files import NpzArrays, UnfitError, check_shares, class_names_of, open_npz, temperature_of
 from gsseg_core.text import clipped
 
 UNOBSERVED, REMOVED = -1, -2
@@ -29,9 +30,9 @@ def read_segmentation(path: Path, digest: str, num_gaussians: int) -> dict[str, 
             raise UnfitError(f"class_names lack 0, the background; found {clipped(list(names))}")
         n, k = num_gaussians, len(names)
         labels = file.expect("labels", np.int32, (n,))
-        shares = file.expect_rows("probabilities", np.float32, (n, k))
+        shares = _expect_rows(file, "probabilities", (n, k))
         clustered = file.expect("clustered", bool, (n,))
-        learnt = file.expect_rows("learnt", np.float32, (int(clustered.sum()), k))
+        learnt = _expect_rows(file, "learnt", (int(clustered.sum()), k))
         unknown_ids = np.setdiff1d(labels, [REMOVED, UNOBSERVED, *names])
         if unknown_ids.size:
             raise UnfitError(
@@ -46,3 +47,9 @@ def read_segmentation(path: Path, digest: str, num_gaussians: int) -> dict[str, 
             "labels": labels, "shares": shares, "class_names": names, "clustered": clustered, "learnt": learnt,
             "temperature": temperature, "tree": ObjectTree.read(file, header, n, k),
         }  # fmt: skip
+
+
+def _expect_rows(file: NpzArrays, name: str, shape: tuple[int, int]) -> CSRRows:
+    """Read probabilities, as `arrays_of_rows` has written them; older files have them with all their zeros."""
+    expect = file.expect_sparse if f"{name}_counts" in file.names else file.expect_rows
+    return expect(name, np.float32, shape)

@@ -34,6 +34,7 @@ COLDEST = 1e-3
 
 _SUFFIX = ".npy"
 _LEVEL = 2  # of compression
+_MOST_WITH_ZEROS = 1 << 28  # bytes of an array of which most is zero: to inflate and scan more takes too long
 _HEADERS = {(1, 0): np.lib.format.read_array_header_1_0, (2, 0): np.lib.format.read_array_header_2_0}
 
 
@@ -232,6 +233,12 @@ def check_evidence(px: npt.NDArray[np.float32], unfit: type[Exception] = UnfitEr
     if bad.size:
         found = f"array evidence holds {px[bad[0]]:g} in row {bad[0]} ({bad.size:,} of {len(px):,} rows are unusable)"
         raise unfit(f"{found}; expected finite numbers of px, 0 or more")
+
+
+def arrays_of_rows(name: str, rows: CSRRows, num_columns: int) -> dict[str, npt.NDArray[Any] | WithZeros]:
+    """Make of N rows of K columns one array with its zeros, or, where that is large, those of `sparse_arrays`."""
+    is_large = rows.num_rows * num_columns * rows.data.itemsize > _MOST_WITH_ZEROS
+    return {**sparse_arrays(name, rows)} if is_large else {name: WithZeros(rows, num_columns)}
 
 
 def sparse_arrays(name: str, rows: CSRRows) -> dict[str, npt.NDArray[Any]]:

@@ -296,6 +296,29 @@ def test_sparse_rows_are_read_and_written_as_numpy_does_it_with_their_zeros(
             np.testing.assert_array_equal(file[name], expected)
 
 
+def test_probabilities_that_were_large_with_their_zeros_are_saved_sparse_and_load_as_the_same(
+    saved: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    expected = Segmentation.load(saved, SCENE)
+    monkeypatch.setattr(npz_files, "_MOST_WITH_ZEROS", 4 * N * NUM_CLASSES - 1)
+    expected.save(saved)
+    with np.load(saved) as file:
+        names = {"probabilities_counts", "probabilities_indices", "probabilities_data", "learnt"}
+        assert {name for name in file.files if name.startswith(("prob", "learnt"))} == names
+    again = Segmentation.load(saved, SCENE)
+    for rows, others in ((again.shares, expected.shares), (again.learnt, expected.learnt)):
+        for ours, theirs in zip(rows, others, strict=True):
+            np.testing.assert_array_equal(ours, theirs, strict=True)
+    data = np.full(len(expected.shares.data), 0.3, np.float32)
+    for arrays, parts in (
+        ({"probabilities_data": data}, ("array probabilities sum to 0.",)),
+        ({"probabilities_counts": np.full(N, 5, np.uint16)}, ("probabilities_counts holds 5; expected at most 4",)),
+    ):
+        expected.save(saved)
+        rewritten(saved, **arrays)
+        assert_refused_in_little_memory(lambda: Segmentation.load(saved, SCENE), StateFileError, *parts)
+
+
 @pytest.mark.parametrize(("change", "part"), [(-4, "shorter"), (4, "longer")])
 def test_sparse_rows_that_end_elsewhere_than_their_header_says_are_refused(saved: Path, change: int, part: str) -> None:
     with zipfile.ZipFile(saved) as file:
