@@ -173,7 +173,7 @@ def segment(
             result = inputs.objects.with_tree(result) if inputs.objects else result
         with ExitStack() as writing:
             behind = writing.enter_context(writing_behind())
-            report = write_run(run, inputs, assessment, result, drawn, settings, watch, behind)
+            report = write_run(run, inputs, assessment, result, drawn, settings, watch, behind, progress)
             with watch.stage("export"):  # what is left of it
                 writing.close()
         write_json(run.folder / "report.json", report.as_dict())

@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import argparse
 
-from gsseg_core.cli.shared import add_collision, add_format, check_not_read
+from gsseg_core.cli.shared import add_collision, add_format, add_quiet, check_not_read
 from gsseg_core.cli.terminal import tell
+from gsseg_core.progress import progress_bars
 
 DESCRIPTION = """
 Writes a valid 3DGS PLY, or a file of another format, of all Gaussians but those of the given classes. What an object
@@ -28,6 +29,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--out", required=True, metavar="FILE", help="file to write")
     add_format(parser.add_argument, None, "what the suffix of FILE says, else ply")
     add_collision(parser.add_argument, "each object that is left, as .obj beside FILE, or in a USD")
+    add_quiet(parser)
 
 
 def run(options: argparse.Namespace) -> int:
@@ -62,7 +64,8 @@ def run(options: argparse.Namespace) -> int:
     chosen = class_ids(options.classes, names, options.segmentation)
     rest = left_without(scene, segmentation, chosen)
     left = np.where(rest, segmentation.labels, REMOVED)
-    meshes = collision_meshes(scene, left, segmentation.confidence, options.collision)
+    with progress_bars(options.quiet) as progress:
+        meshes = collision_meshes(scene, left, segmentation.confidence, options.collision, progress)
     write_selection(scene, rest, segmentation.labels, segmentation.class_names, options.out, scene_format, meshes)
     removed = listed(f"{k} ({clipped(names[k])})" for k in chosen)
     tell(f"without {removed}: {int(rest.sum()):,} of {counted(len(scene), 'Gaussian')} in {options.out}")

@@ -18,9 +18,12 @@ from gsseg_core.errors import SettingsError
 from gsseg_core.export.poisson_surface import Ellipsoids, Voxels, poisson_surface, sphere
 from gsseg_core.objects.occupied_cells import OPAQUE
 from gsseg_core.objects.oriented_boxes import without_floaters
+from gsseg_core.progress import Progress, silent
 from gsseg_core.scene.gaussian_scene import GaussianScene
 from gsseg_core.scene.quaternions import half_axes
 from gsseg_core.scene.triangle_mesh import TriangleMesh
+from gsseg_core.several_at_once import each_with_made
+from gsseg_core.spatial.row_order import rows_by_label
 
 HULL, SURFACE, POISSON = "hull", "surface", "poisson"
 KINDS = (HULL, SURFACE, POISSON)
@@ -51,15 +54,22 @@ def collision_meshes(
     labels: npt.NDArray[np.integer],  # (N,): the object of each Gaussian; 0 and below for none
     confidence: npt.NDArray[np.floating],  # (N,)
     kind: str | None,
+    progress: Progress = silent,
 ) -> dict[int, TriangleMesh]:
     """Make a mesh of a kind for every object, by its label, ascending; none where the kind is None.
 
     There is none for objects without an opaque Gaussian or a volume. Raises what `check_collision` does.
     """
     check_collision(kind)
-    present = np.unique(labels[labels > 0]).tolist() if kind else []
-    made = {k: collision_mesh(scene, np.flatnonzero(labels == k), confidence, str(kind)) for k in present}
-    return {k: mesh for k, mesh in made.items() if mesh is not None}
+    if kind is None:
+        return {}
+    members = {k: ids for k, ids in rows_by_label(labels).items() if k > 0}
+
+    def make(k: int) -> TriangleMesh | None:
+        return collision_mesh(scene, members[k], confidence, kind)
+
+    made = each_with_made(make, members, "cpu", progress, "mesh")
+    return {k: mesh for k, mesh in made if mesh is not None}
 
 
 def collision_mesh(

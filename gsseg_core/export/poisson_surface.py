@@ -120,8 +120,8 @@ def _potential(field: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:  # (3
 
     shape = field.shape[1:]
     waves = [2 * np.pi * fft.fftfreq(n) for n in shape[:2]] + [2 * np.pi * fft.rfftfreq(shape[2])]
-    k = np.stack(np.meshgrid(*waves, indexing="ij"))
-    squared = (k**2).sum(axis=0)
+    k = np.meshgrid(*waves, indexing="ij", sparse=True)
+    squared = k[0] ** 2 + k[1] ** 2 + k[2] ** 2
     divergence = sum(1j * k[i] * fft.rfftn(field[i]) for i in range(3))
     solved = np.where(squared > 0, divergence / np.maximum(squared, 1e-12), 0) * np.exp(-(_SMOOTH**2) * squared / 2)
     return fft.irfftn(solved, shape)

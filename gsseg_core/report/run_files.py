@@ -19,7 +19,7 @@ from gsseg_core.files.write_behind import WriteBehind
 from gsseg_core.learn.calibrate import Calibration
 from gsseg_core.learn.mask_reliability import ViewCheck, compare_mask
 from gsseg_core.objects.object_table import ObjectTable
-from gsseg_core.progress import Stopwatch
+from gsseg_core.progress import Progress, Stopwatch
 from gsseg_core.report.findings import MaskChecks
 from gsseg_core.report.page import load_templates, write_report_page
 from gsseg_core.report.pictures import ViewImages
@@ -63,7 +63,7 @@ class Assessment:
 
 def write_run(
     run: StagedRun, inputs: Inputs, assessment: Assessment, result: Segmentation, drawn: Mapping[str, Drawn],
-    settings: RunSettings, watch: Stopwatch, behind: WriteBehind[...],
+    settings: RunSettings, watch: Stopwatch, behind: WriteBehind[...], progress: Progress,
 ) -> RunReport:  # fmt: skip
     """Write all files of a run but `report.json`, some of them behind the work, and report it."""
     scene, folder, level = inputs.scene, run.folder, result.at(settings.granularity)
@@ -75,7 +75,7 @@ def write_run(
             run.claim(settings.places(level.class_names, inputs.pictured))
         in_file = named if inputs.places is None else named.in_order_of(inputs.digest, inputs.places)
         behind(in_file.save, folder / "segmentation.npz", run.id)
-        meshes = collision_meshes(scene, exported.labels, exported.confidence, settings.collision)
+        meshes = collision_meshes(scene, exported.labels, exported.confidence, settings.collision, progress)
         files = class_paths(exported, folder / "classes", settings.scene_format)
         behind(write_classes, scene, exported, folder / "classes", run.id, settings.scene_format, meshes, inputs.places)
     with watch.stage("pictures"):

@@ -221,6 +221,15 @@ def test_single_files_replace_no_device_and_keep_links(place: Path, capsys: pyte
     assert (place / "link.ply").is_symlink() and len(GaussianScene.load(place / "rest.ply")) > 0
 
 
+def test_remove_shows_how_many_meshes_are_made_and_quiet_hides_it(
+    place: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    remove = ["remove", f"{place}/data/scene.ply", "--segmentation", f"{place}/out/segmentation.npz", "--class", "1"]
+    for quiet in (False, True):
+        assert main([*remove, "--out", f"{place}/rest.ply", "--collision", *["--quiet"] * quiet]) == 0
+        assert ("mesh: " in capsys.readouterr().err) != quiet
+
+
 @pytest.mark.parametrize("saved", ["out/report.json", "out/pictures/legend.png", "state.npz"])
 def test_remove_replaces_nothing_but_scenes(place: Path, capsys: pytest.CaptureFixture[str], saved: str) -> None:
     shutil.copy(place / "out/segmentation.npz", place / "state.npz")

@@ -121,6 +121,15 @@ def test_every_object_but_the_background_has_a_closed_mesh(tmp_path: Path, kind:
         assert path.read_text().startswith("# gsseg_run ")
 
 
+def test_meshes_tell_how_many_are_made_and_no_meshes_tell_nothing() -> None:
+    told: list[tuple[str, int, int]] = []
+    result = segmented()
+    for kind in (None, HULL):
+        made = collision_meshes(SCENE, result.labels, result.confidence, kind, lambda *step: told.append(step))
+        assert told == ([] if kind is None else [("mesh", done, 3) for done in range(4)])
+    assert list(made) == [1, 2, 3]
+
+
 def test_a_surface_follows_a_hollow_that_a_hull_closes() -> None:
     turns = 2 * np.pi * np.arange(200) / 200
     rings = [np.stack([np.cos(turns) * r, np.sin(turns) * r, np.full(200, z)], axis=1)
