@@ -29,7 +29,6 @@ from gsseg_core.learn.mask_reliability import MaskChecker, reliability_report, s
 from gsseg_core.learn.prepared_views import default_budget
 from gsseg_core.learn.registry import make_learner
 from gsseg_core.learn.usable_views import NO_MASK, SEES_NOTHING
-from gsseg_core.objects.object_table import find_objects
 from gsseg_core.progress import Progress, Stopwatch, silent, with_progress
 from gsseg_core.refine.label_propagation import UNKNOWN_SHARE, GraphSettings, propagate
 from gsseg_core.refine.settings import RefineSettings
@@ -228,6 +227,8 @@ def _ids(dataset: Dataset, settings: RunSettings) -> str:
 
 def _associate(inputs: Inputs, device: str, progress: Progress) -> Inputs:
     """Find which ids of the views are the same object, and number the objects."""
+    from gsseg_core.objects.object_table import find_objects  # It needs SciPy, which takes a while to load.
+
     found = find_objects(inputs.scene, inputs.train, device=device, progress=progress)
     train = [found.relabelled(view) for view in inputs.train]
     return replace(inputs, train=train, class_names=found.class_names, objects=found)

@@ -27,6 +27,7 @@ from gsseg_core.learn.vote_learner import VoteLearner
 from gsseg_core.learn.vote_resolution import resolved_votes
 from gsseg_core.objects import association_kernels, move_kernels, tree_kernels
 from gsseg_core.objects.clicks import merge_tree
+from gsseg_core.objects.convex_hull import hull_faces
 from gsseg_core.objects.heaviest import heaviest
 from gsseg_core.objects.rectangles import rectangles_around
 from gsseg_core.raster.backends import make_operator
@@ -175,7 +176,8 @@ def refine_something(device: str = "cpu") -> None:
     result = Segmentation.from_codes(scene, codes, {0: "left", 1: "right"}, PAPER).carved(scene, [camera])
     operator = make_operator(scene, camera, device)
     result.calibrated(2.0).render(operator)
-    rectangles_around(np.array([[0.0, 0.0], [0.0, 1.0], [1.0, 0.0]]))  # as for boxes
+    hull_faces(np.eye(4, 3))  # as for boxes
+    rectangles_around(np.array([[0.0, 0.0], [0.0, 1.0], [1.0, 0.0]]))
     operator.render(scene.colors(camera.center))
     overlay(np.zeros((*labels.shape, 3), np.uint8), labels, palette(2))
     in_curve_order(scene)

@@ -18,8 +18,8 @@ from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import numpy as np
+from numpy.lib.stride_tricks import sliding_window_view
 from PIL import Image
-from scipy import ndimage
 
 from gsseg_core.align.settings import AlignSettings
 from gsseg_core.data.label_images import UNKNOWN
@@ -34,6 +34,10 @@ from gsseg_core.several_at_once import several_at_once
 
 LUMINANCE = np.array([0.299, 0.587, 0.114], np.float32)  # of RGB, ITU-R BT.601
 _EDGE_PX = 3  # reach of the filter that finds edges, px of a picture
+_REACH = 4  # standard deviations of the filter, of 1 px, to either side
+_BLUR = np.exp(-0.5 * np.arange(-_REACH, _REACH + 1, dtype=np.float32) ** 2)  # its weights
+_BLUR /= _BLUR.sum()
+_SLOPE = np.arange(-_REACH, _REACH + 1, dtype=np.float32) * _BLUR  # of a blurred picture, a px
 _WIDEST = 1e4  # tangent of half the field of view; a camera that claims more is broken
 _NEAREST = 1e-3  # depth in scene units below which logarithms are not taken
 
@@ -176,7 +180,7 @@ def _mask(view: View, picture_px: int) -> Shown:
     outlines[:, 1:] = np.maximum(outlines[:, 1:], labels[:, 1:] != labels[:, :-1])
     edges = window.cut(Image.fromarray(outlines), Image.Resampling.BILINEAR)
     regions = window.cut(Image.fromarray(labels), Image.Resampling.NEAREST)
-    return Shown(window.camera, window.seen, ndimage.gaussian_filter(edges, 1), np.where(window.seen, regions, UNKNOWN))
+    return Shown(window.camera, window.seen, _filtered(edges, _BLUR, _BLUR), np.where(window.seen, regions, UNKNOWN))
 
 
 class _Window(NamedTuple):
@@ -216,7 +220,16 @@ def _edges(picture: np.ndarray) -> np.ndarray:  # (S, S)
 
 
 def _gradient(picture: np.ndarray) -> np.ndarray:  # (S, S)
-    return ndimage.gaussian_gradient_magnitude(picture, 1.0)
+    return np.hypot(_filtered(picture, _SLOPE, _BLUR), _filtered(picture, _BLUR, _SLOPE))
+
+
+def _filtered(picture: np.ndarray, down: np.ndarray, across: np.ndarray) -> np.ndarray:  # (S, S), (T,), (T,)
+    """Weigh the neighbours of each pixel; SciPy's filters take longer to load than all pictures that are compared."""
+    padded = np.pad(picture, _REACH, "symmetric")
+    filtered: np.ndarray = (
+        sliding_window_view(sliding_window_view(padded, len(down), 0) @ down, len(across), 1) @ across
+    )
+    return filtered
 
 
 def _correlation(first: np.ndarray, second: np.ndarray) -> float:  # (P,), (P,)

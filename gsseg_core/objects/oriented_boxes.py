@@ -20,7 +20,6 @@ All of this turns, moves and scales with the scene, and no direction is taken fo
 
 from __future__ import annotations
 
-from contextlib import suppress
 from dataclasses import dataclass
 from itertools import pairwise, product
 from typing import TYPE_CHECKING, Any
@@ -178,21 +177,21 @@ def _turned(offsets: Array, share: Array, axes: Array) -> Array:
 
     It begins with the axes given, and with the sides of the points' hull.
     """
-    from scipy.spatial import ConvexHull, QhullError  # Who reads boxes only, as a client does, starts without.
+    from gsseg_core.objects.convex_hull import hull_faces  # Who reads boxes only, as a client does, starts without.
 
     along = offsets @ axes
     low, high = _quantile(along, share, TRIM), -_quantile(-along, share, TRIM)
     points = offsets[((along >= low) & (along <= high)).all(axis=1)]
     if len(points) < 4:  # In one plane, so that boxes of no volume contain them: nothing to choose by.
         return axes
-    starts = [axes]
-    with suppress(QhullError):  # All in one plane.
-        hull = ConvexHull(points)
-        corners = points[hull.simplices]
-        areas = np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1)
-        largest = np.argsort(-areas, kind="stable")[:_SIDES]
-        points = points[hull.vertices]
-        starts += [_turned_about(points, _completed(hull.equations[side, :3], axes), 0) for side in largest]
+    starts, faces = [axes], hull_faces(points)
+    if len(faces):  # Not all in one plane.
+        corners = points[faces]
+        normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+        areas = np.linalg.norm(normals, axis=1)
+        points = points[np.unique(faces)]
+        for side in np.argsort(-areas, kind="stable")[:_SIDES]:
+            starts.append(_turned_about(points, _completed(normals[side] / areas[side], axes), 0))
     sides = np.stack([np.ptp(points @ start, axis=0) for start in starts])
     axes = starts[_least(sides.prod(axis=1), sides.sum(axis=1))]
     for _ in range(_PASSES):

@@ -18,7 +18,6 @@ from gsseg_core.files.run_folder import StagedRun
 from gsseg_core.files.write_behind import WriteBehind
 from gsseg_core.learn.calibrate import Calibration
 from gsseg_core.learn.mask_reliability import ViewCheck, compare_mask
-from gsseg_core.objects.object_table import ObjectTable
 from gsseg_core.progress import Progress, Stopwatch
 from gsseg_core.report.findings import MaskChecks
 from gsseg_core.report.page import load_templates, write_report_page
@@ -29,6 +28,8 @@ from gsseg_core.segmentation import Segmentation
 
 if TYPE_CHECKING:
     import numpy as np
+
+    from gsseg_core.objects.object_table import ObjectTable
 
 
 @dataclass(frozen=True, eq=False)

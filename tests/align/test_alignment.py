@@ -12,8 +12,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 from PIL import Image
+from scipy import ndimage
 from scipy.spatial.transform import Rotation
 
+from gsseg_core.align import agreement as comparison
 from gsseg_core.align import conventions, placing
 from gsseg_core.align.agreement import Agreement, agreement, look_at, render, thinned
 from gsseg_core.align.conventions import AXIS_ROTATIONS, OPENGL, Convention
@@ -148,6 +150,16 @@ def test_no_focal_length_ends_in_an_error_of_pillow(focal: tuple[float, float]) 
     camera = Camera("v", 64, 48, np.array([[focal[0], 0, 32], [0, focal[1], 24], [0, 0, 1]]), np.eye(4))
     shown = look_at([View.from_arrays(camera, np.arange(64 * 48).reshape(48, 64) % 3)], AlignSettings())
     assert len(shown) == 1 and np.isfinite(shown[0].edges).all()
+
+
+@pytest.mark.parametrize("side", [1, 3, 96])
+def test_pictures_are_filtered_as_scipy_does(side: int) -> None:
+    picture = np.random.default_rng(side).random((side, side), np.float32)
+    blurred = comparison._filtered(picture, comparison._BLUR, comparison._BLUR)
+    np.testing.assert_allclose(blurred, ndimage.gaussian_filter(picture, 1), rtol=1e-5)
+    slopes = comparison._gradient(picture)
+    np.testing.assert_allclose(slopes, ndimage.gaussian_gradient_magnitude(picture, 1), atol=1e-5)
+    assert slopes.dtype == blurred.dtype == np.float32
 
 
 def test_turning_a_picture_is_turning_its_camera(demo: Path, scene: GaussianScene) -> None:

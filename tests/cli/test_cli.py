@@ -223,6 +223,12 @@ def test_the_package_and_the_pipeline_load_neither_pytorch_nor_templates() -> No
     subprocess.run([sys.executable, "-c", program], check=True)
 
 
+def test_where_ids_hold_in_all_views_nobody_waits_for_scipy(place: Path) -> None:
+    loaded = "{'scipy.' + part for part in ('linalg', 'ndimage', 'optimize', 'sparse', 'spatial')} & sys.modules.keys()"
+    program = f"import sys; from gsseg_core.cli.main import main; sys.exit(main(sys.argv[1:]) or {loaded} or 0)"
+    subprocess.run([sys.executable, "-c", program, *segment(place)], check=True, stdout=subprocess.DEVNULL)
+
+
 def test_the_demo_segments_its_scene_well(demo_run: Path) -> None:
     found = re.search(r"mIoU ([0-9.]+) %", (demo_run / "said.txt").read_text())
     assert found is not None and float(found[1]) > 80
