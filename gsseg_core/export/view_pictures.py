@@ -22,7 +22,7 @@ from gsseg_core.scene.gaussian_scene import GaussianScene
 from gsseg_core.segmentation import Segmentation
 from gsseg_core.several_at_once import several_at_once
 
-LEGEND_CLASSES = 1_000  # more than this are a vocabulary, most of which no scene has
+LEGEND_CLASSES = 100  # more than this are a vocabulary or found objects, some of which no Gaussian belongs to
 _DIFFERENT = np.array([[0, 0, 0], [230, 40, 40]], np.uint8)
 SavePicture = Callable[[Path, np.ndarray], object]  # writes a picture as `save_png` does, now or later
 _LONGEST_NAME = 255  # bytes of the name of a file, at most, on all file systems
@@ -123,7 +123,7 @@ def write_overview(
 ) -> list[Path]:
     """Write `contact_sheet.png` of some pictures, if there are any, and `legend.png`.
 
-    Of more than `LEGEND_CLASSES` classes, as a vocabulary has, the legend shows those that Gaussians belong to.
+    Of more than `LEGEND_CLASSES` classes the legend shows those that Gaussians belong to.
     """
     paths = []
     if images:

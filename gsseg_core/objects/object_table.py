@@ -266,10 +266,11 @@ class ObjectTable:
 
     def summary(self, result: Segmentation) -> dict[str, Any]:
         """Put together what `report.json` says of the ids, and of the parts and wholes of a result."""
-        tree = result.tree
+        tree, counts = result.tree, result.counts()
         views = {name: asdict(self.objects_in(name)) for name in sorted(self._objects)}
         return {
             "objects": self.num_objects,
+            "without_gaussians": [k for k in result.class_names if k and not counts[k]],
             "granularity": self._agreement,
             "segments": sum(len(lifted) for lifted in self._lifted.values()),
             "merged": sum(view["merged"] for view in views.values()),

@@ -95,7 +95,9 @@ def write_run(
         )  # fmt: skip
         told = report if level is result else replace(report, classes=class_table(scene, result))
         write_report_page(folder / "report.html", PageInputs(told.as_dict(), scene, result, checked, images))
-    return replace(report, page="report.html", seconds=watch.seconds)
+    # Of objects, those that learning gave no Gaussian are none; a class that was asked for is told of in any case.
+    classes = [one for one in report.classes if one["gaussians"] or not (inputs.objects and one["id"])]
+    return replace(report, classes=classes, page="report.html", seconds=watch.seconds)
 
 
 def _picture(

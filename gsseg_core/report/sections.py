@@ -163,7 +163,8 @@ def classes(run: PageInputs) -> Content:
             "parts": [] if tree is None else [run.nodes[part][1:] for part in tree.inside(k)],
         }
         for k, entry in enumerate(entries)
-        if k or entry["gaussians"]  # Masks need not show any background.
+        # Masks need not show any background, and objects without a Gaussian are none.
+        if entry["gaussians"] or (k and not run.report.get("ids"))
     ]
     return {"classes": rows, "many": MANY, "num_views": len(checked.checks), "held_out": checked.held_out}
 

@@ -33,7 +33,7 @@ from gsseg_core.errors import SceneValueError, SettingsError
 from gsseg_core.learn.em.em_learner import EMLearner
 from gsseg_core.objects.association import AssociationSettings, associate
 from gsseg_core.objects.lifted_segments import Lifted
-from gsseg_core.objects.object_table import ObjectTable, find_objects
+from gsseg_core.objects.object_table import ObjectTable, find_objects, object_name
 from gsseg_core.raster.backends import make_operator
 from gsseg_core.scene.gaussian_scene import GaussianScene
 from gsseg_core.segmentation import Segmentation
@@ -273,6 +273,24 @@ def test_objects_found_are_learnt_as_well_as_with_true_ids() -> None:
     score = Contingency()
     score.add(true.fit().codes_.argmax(axis=1)[:, None], labels[:, None])
     assert score.ari == pytest.approx(1.0)
+
+
+def test_objects_that_end_without_a_gaussian_are_listed_apart_and_ids_stay(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    data = write_dataset(tmp_path / "data", SCENE, TRUTH, ring(9), NAMES)
+    monkeypatch.setattr(ObjectTable, "class_names", {k: object_name(k) for k in range(6)})  # Two more than views show.
+    for level in ([], ["--granularity", "0.5"]):
+        inputs = [f"{data}/scene.ply", "--data", str(data), "--quiet", "--ids", "per-view", *level]
+        assert main(["segment", *inputs, "--out", f"{tmp_path}/out"]) == 0
+        report = json.loads((tmp_path / "out/report.json").read_text())
+        assert [one["id"] for one in report["classes"]] == [0, 1, 2, 3]
+        assert report["ids"]["objects"] == 3 and report["ids"]["without_gaussians"] == [4, 5]
+        page = (tmp_path / "out/report.html").read_text()
+        assert "<bdi>object_003</bdi>" in page and "<bdi>object_004</bdi>" not in page
+        assert "got no Gaussian" in page
+        with np.load(tmp_path / "out/segmentation.npz") as file:
+            assert file["class_ids"].tolist() == [0, 1, 2, 3, 4, 5]
 
 
 def test_the_command_finds_the_objects_and_reports_what_the_ids_meant(tmp_path: Path) -> None:
