@@ -56,8 +56,10 @@ def camera_hint(folder: Path) -> str:
     for name, advice in _FOREIGN_CAMERAS.items():
         if (folder / name).is_file():
             return f"; found {name}: {advice}"
-    names = sorted(path.name + "/" * path.is_dir() for path in folder.iterdir() if not path.name.startswith("."))
-    return f"; found {', '.join(names[:8])}{' ...' if len(names) > 8 else ''}" if names else "; the folder is empty"
+    with suppress(OSError):
+        names = sorted(path.name + "/" * path.is_dir() for path in folder.iterdir() if not path.name.startswith("."))
+        return f"; found {', '.join(names[:8])}{' ...' if len(names) > 8 else ''}" if names else "; the folder is empty"
+    return ""
 
 
 def mask_hint(root: Path, labels: str, stems: Collection[str]) -> str:

@@ -10,7 +10,10 @@ import hashlib
 import os
 import struct
 import zlib
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from functools import cached_property
+from io import BufferedReader
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -21,7 +24,7 @@ from PIL.PngImagePlugin import PngInfo
 
 from gsseg_core.errors import MaskFormatError, SettingsError
 from gsseg_core.files.atomic import write_atomically
-from gsseg_core.files.input_files import check_pixels, open_image, open_input, reason
+from gsseg_core.files.input_files import check_pixels, decode_image, open_input, reason
 
 UNKNOWN = -1
 
@@ -42,19 +45,26 @@ class Mask(NamedTuple):
     bits: int
 
 
-def read_mask(path: str | os.PathLike[str], within: Path | None = None) -> Mask:
+def read_mask(
+    path: str | os.PathLike[str],
+    within: Path | None = None,
+    check_size: Callable[[int, int], None] = lambda width, height: None,
+) -> Mask:
     """Read a label image: a PNG with 8- or 16-bit gray values, or palette indices, as labels.
 
     Its labels (H, W) int32 are `UNKNOWN` where the file has 255 (8 bits) or 65535 (16 bits). With `within`, it must lie
     below that folder, links followed (else `PathNotAllowedError`). Raises `MaskFormatError` where it is missing or
-    broken, or another kind of image (RGB, alpha, 1-bit, not a PNG).
+    broken, or another kind of image (RGB, alpha, 1-bit, not a PNG), and what `check_size` raises of its width and
+    height, before any pixel is read.
     """
-    bits = mask_header(path, within).bits
-    # Other formats are lossy or ambiguous about integers, whatever the file is named.
-    with open_image(path, MaskFormatError, "PNG", "a whole label image", ("PNG",), within) as image:
-        labels = np.array(image).astype(np.int32)
-    labels[labels == 2**bits - 1] = UNKNOWN
-    return Mask(labels, bits)
+    with _open_mask(path, within) as file:
+        header = _read_header(file, str(path))
+        check_size(header.width, header.height)
+        # Other formats are lossy or ambiguous about integers, whatever the file is named.
+        with decode_image(file, str(path), MaskFormatError, "PNG", "a whole label image", ("PNG",)) as image:
+            labels = np.array(image).astype(np.int32)
+    labels[labels == 2**header.bits - 1] = UNKNOWN
+    return Mask(labels, header.bits)
 
 
 class MaskHeader(NamedTuple):
@@ -67,19 +77,30 @@ class MaskHeader(NamedTuple):
 
 def mask_header(path: str | os.PathLike[str], within: Path | None = None) -> MaskHeader:
     """Read the header of a label image; raises as `read_mask` does."""
+    with _open_mask(path, within) as file:
+        return _read_header(file, str(path))
+
+
+@contextmanager
+def _open_mask(path: str | os.PathLike[str], within: Path | None) -> Iterator[BufferedReader]:
+    """Open a label image, once for header and pixels: in between, another file may take its name."""
     try:
         with open_input(path, within) as file:
-            header = file.read(26)
+            yield file
     except OSError as error:
         raise MaskFormatError(f"{path}: cannot be read ({reason(error)}); expected a label image") from error
-    kind, depth, width, height = png_header(header, str(path))
+
+
+def _read_header(file: BufferedReader, source: str) -> MaskHeader:
+    kind, depth, width, height = png_header(file.read(26), source)
     if kind != "palette" and (kind != "gray" or depth not in (8, 16)):
         colours = "of ids drawn in colours save the ids themselves (a palette made for each image numbers them anew)"
         fix = f"; a photo is no mask, and {colours}" if "RGB" in kind else ""
         raise MaskFormatError(
-            f"{path}: is {kind} of {depth} bits per channel; expected a one-channel 8- or 16-bit PNG of labels{fix}"
+            f"{source}: is {kind} of {depth} bits per channel; expected a one-channel 8- or 16-bit PNG of labels{fix}"
         )
-    check_pixels(width, height, str(path), MaskFormatError)
+    check_pixels(width, height, source, MaskFormatError)
+    file.seek(0)
     return MaskHeader(8 if kind == "palette" else depth, width, height)
 
 

@@ -19,7 +19,8 @@ import numpy as np
 from gsseg_core.csr_rows import CSRRows
 from gsseg_core.data.class_names import class_name
 from gsseg_core.errors import SettingsError
-from gsseg_core.files.npz_files import NpzArrays, UnfitError
+from gsseg_core.files.input_files import UnfitError
+from gsseg_core.files.npz_files import NpzArrays
 from gsseg_core.text import quoted
 
 PART, OBJECT, WHOLE = "part", "object", "whole"

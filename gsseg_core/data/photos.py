@@ -20,5 +20,5 @@ def read_photo(view: View) -> npt.NDArray[np.uint8] | None:
                 return None
             taken, undistortion = np.asarray(photo.convert("RGB")), view.camera.undistortion
             return taken if undistortion is None else undistortion.photo(taken)
-    except MaskFormatError:  # What is only looked at is not worth an error.
+    except (MaskFormatError, MemoryError):  # What is only looked at is not worth an error.
         return None

@@ -9,7 +9,8 @@ import numpy as np
 
 from gsseg_core.csr_rows import CSRRows
 from gsseg_core.data.object_tree import ObjectTree
-from gsseg_core.files.npz_files import NpzArrays, UnfitError, check_shares, class_names_of, open_npz, temperature_of
+from gsseg_core.files.input_files import UnfitError
+from gsseg_core.files.npz_files import NpzArrays, check_shares, class_names_of, open_npz, temperature_of
 from gsseg_core.text import clipped
 
 UNOBSERVED, REMOVED = -1, -2

@@ -37,10 +37,17 @@ _KINDS = {
     stat.S_IFCHR: "a device", stat.S_IFBLK: "a device",
 }  # fmt: skip
 DAMAGED = (
-    OSError, SyntaxError, ValueError, TypeError, AttributeError, LookupError, ArithmeticError, EOFError, MemoryError,
+    OSError, SyntaxError, ValueError, TypeError, AttributeError, LookupError, ArithmeticError, EOFError,
     RuntimeError, struct.error, zlib.error, zipfile.BadZipFile, tokenize.TokenError, Image.DecompressionBombError,
 )  # fmt: skip
-"""What Pillow, NumPy, zipfile and zlib raise on damaged bytes; RuntimeError where a flipped bit says "encrypted"."""
+"""What Pillow, NumPy, zipfile and zlib raise on damaged bytes; RuntimeError where a flipped bit says "encrypted".
+
+That memory is not enough is no damage: a mask would count as broken, and be left out, without a word of the cause.
+"""
+
+
+class UnfitError(ValueError):
+    """Content of a file that can be read, but not used; the message says what was found, and what was expected."""
 
 
 def open_input(path: str | os.PathLike[str], within: Path | None = None) -> BufferedReader:
@@ -103,7 +110,9 @@ def require_below(target: str, path: str | os.PathLike[str], within: Path) -> No
 
 
 def list_folder(folder: Path, error: type[GssegError], within: Path | None) -> list[Path]:
-    """List what is in a folder, sorted; nothing if there is no folder. With `within`, it must lie below that.
+    """List what is in a folder and not hidden, sorted; nothing if there is no folder. With `within`, it must lie below.
+
+    Hidden is, for one, `._mask.png`, which macOS writes beside each `mask.png` on disks that are not its own.
 
     Raises `error` where it cannot be read.
     """
@@ -112,18 +121,18 @@ def list_folder(folder: Path, error: type[GssegError], within: Path | None) -> l
             return []
         if within is not None:
             require_below(os.path.realpath(folder), folder, within)
-        return sorted(folder.iterdir())
+        return sorted(path for path in folder.iterdir() if not path.name.startswith("."))
     except OSError as cause:
         raise error(f"{folder}: cannot be read ({reason(cause)}); expected a folder that can be listed") from cause
 
 
 def list_below(folder: Path, error: type[GssegError], within: Path | None, depth: int = 4) -> list[Path]:
-    """List the files of a folder and, `depth` levels down, of its folders that are not hidden, by `list_folder`."""
+    """List the files of a folder and, `depth` levels down, of its folders, by `list_folder`."""
     files: list[Path] = []
     for path in list_folder(folder, error, within):
         if not path.is_dir():
             files.append(path)
-        elif depth and not path.name.startswith("."):
+        elif depth:
             files += list_below(path, error, within, depth - 1)
     return files
 

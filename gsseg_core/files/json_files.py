@@ -9,8 +9,8 @@ from typing import Any
 
 from gsseg_core.errors import GssegError
 from gsseg_core.files.atomic import write_atomically
-from gsseg_core.files.input_files import read_input
-from gsseg_core.text import clipped
+from gsseg_core.files.input_files import UnfitError, read_input
+from gsseg_core.text import clipped, quoted
 
 _KINDS = {
     dict: "an object", list: "a list", str: "text", bool: "true or false", int: "a number", float: "a number",
@@ -39,6 +39,13 @@ def read_object(path: Path, error: type[GssegError], expected: str, within: Path
 def kind_of(content: object) -> str:
     """Name what a JSON file holds, in the words of JSON."""
     return _KINDS[type(content)]
+
+
+def whole_number(value: object, what: str, least: int, most: int) -> int:
+    """Check a number of a JSON header; `UnfitError` unless it is whole, and from `least` to `most`."""
+    if type(value) is not int or not least <= value <= most:
+        raise UnfitError(f"{what} is {quoted(value)}; expected a whole number from {least} to {most}")
+    return value
 
 
 def write_json(path: str | os.PathLike[str], content: object) -> None:

@@ -21,7 +21,8 @@ import numpy.typing as npt
 from gsseg_core.csr_rows import CSRRows, slices, starts
 from gsseg_core.errors import GssegError, StateFileError, StateMismatchError
 from gsseg_core.files.atomic import write_atomically
-from gsseg_core.files.input_files import DAMAGED, open_input, reason
+from gsseg_core.files.input_files import DAMAGED, UnfitError, open_input, reason
+from gsseg_core.files.json_files import whole_number
 from gsseg_core.files.limits import LIMITS, MAX_LABEL
 from gsseg_core.kernels.compiler import kernel
 from gsseg_core.text import clipped, quoted
@@ -36,10 +37,6 @@ _SUFFIX = ".npy"
 _LEVEL = 2  # of compression
 _MOST_WITH_ZEROS = 1 << 28  # bytes of an array of which most is zero: to inflate and scan more takes too long
 _HEADERS = {(1, 0): np.lib.format.read_array_header_1_0, (2, 0): np.lib.format.read_array_header_2_0}
-
-
-class UnfitError(ValueError):
-    """Content of a file that can be read, but not used; the message says what was found, and what was expected."""
 
 
 class Header(NamedTuple):
@@ -171,13 +168,6 @@ def _read_header(member: Any, name: str) -> tuple[Header, bool]:
     if math.prod(header.shape) * header.dtype.itemsize > LIMITS.max_npz_bytes:
         raise ValueError(f"array {name!r} is {header}; expected at most {LIMITS.max_npz_bytes:,} bytes")
     return header, by_column
-
-
-def whole_number(value: object, what: str, least: int, most: int) -> int:
-    """Check a number of a JSON header; `UnfitError` unless it is whole, and from `least` to `most`."""
-    if type(value) is not int or not least <= value <= most:
-        raise UnfitError(f"{what} is {quoted(value)}; expected a whole number from {least} to {most}")
-    return value
 
 
 def temperature_of(header: dict[str, Any]) -> float:

@@ -63,7 +63,7 @@ class Manifest:
                 str(kind): RunRecord(str(run["run"]), _files(run["files"])) for kind, run in content["runs"].items()
             }
             return cls(runs, str(content["staging"]), _files(content.get("before", {})))
-        except (FileNotFoundError, ValueError, TypeError, KeyError, AttributeError, RecursionError):
+        except (FileNotFoundError, ValueError, TypeError, KeyError, AttributeError, RecursionError, OverflowError):
             return cls()
 
     def files(self, kind: str) -> dict[str, FileRecord]:

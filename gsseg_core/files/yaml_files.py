@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import Any
 
 from gsseg_core.errors import GssegError, SettingsError
-from gsseg_core.files.input_files import read_input
+from gsseg_core.files.input_files import DAMAGED, read_input
 from gsseg_core.text import clipped
 
 _MOST_BYTES = 2**20
@@ -29,5 +29,5 @@ def read_yaml(path: Path, error: type[GssegError], within: Path | None = None) -
         if any(isinstance(event, yaml.AliasEvent) for event in yaml.parse(content, yaml.SafeLoader)):
             raise error(f"{path}: uses anchors, as in *name; expected YAML without")
         return yaml.load(content, yaml.SafeLoader)
-    except (yaml.YAMLError, ValueError, RecursionError) as cause:
+    except (yaml.YAMLError, *DAMAGED) as cause:  # PyYAML trips over values such as `!!bool 7` itself.
         raise error(f"{path}: not valid YAML ({clipped(cause, 160)})") from cause

@@ -25,10 +25,11 @@ from gsseg_core.data.soft_masks import TOLERANCE, SeenLabels
 from gsseg_core.data.view import View
 from gsseg_core.errors import GssegError, StateFileError
 from gsseg_core.files.atomic import check_replaceable, write_atomically
+from gsseg_core.files.input_files import UnfitError
+from gsseg_core.files.json_files import whole_number
 from gsseg_core.files.limits import LIMITS, MAX_LABEL
 from gsseg_core.files.npz_files import (
     NpzArrays,
-    UnfitError,
     check_evidence,
     check_scene,
     check_shares,
@@ -37,7 +38,6 @@ from gsseg_core.files.npz_files import (
     open_npz,
     sparse_arrays,
     temperature_of,
-    whole_number,
     write_arrays,
 )
 from gsseg_core.scene import living_files

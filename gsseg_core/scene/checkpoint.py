@@ -12,8 +12,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from gsseg_core.files.input_files import OPENED
-from gsseg_core.files.npz_files import UnfitError
+from gsseg_core.files.input_files import OPENED, UnfitError
 from gsseg_core.scene.scene_file import open_scene, size_of
 from gsseg_core.scene.spherical_harmonics import MAX_DEGREE
 from gsseg_core.scene.vertices import ReadScene, dc_of, pack_vertices

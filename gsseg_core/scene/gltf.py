@@ -15,9 +15,8 @@ import numpy as np
 import numpy.typing as npt
 
 from gsseg_core.errors import SceneFileError
-from gsseg_core.files.input_files import open_input, reason
+from gsseg_core.files.input_files import UnfitError, open_input, reason
 from gsseg_core.files.limits import LIMITS
-from gsseg_core.files.npz_files import UnfitError
 from gsseg_core.scene.camera import rigid_motion
 from gsseg_core.scene.moving import move
 from gsseg_core.scene.quaternions import rotations

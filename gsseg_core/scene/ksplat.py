@@ -9,7 +9,7 @@ from typing import NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from gsseg_core.files.npz_files import UnfitError
+from gsseg_core.files.input_files import UnfitError
 from gsseg_core.scene.scene_file import check_size, open_scene
 from gsseg_core.scene.vertices import ReadScene, dc_of, log_scales, logits, pack_vertices
 

@@ -8,7 +8,9 @@ import numpy as np
 import numpy.typing as npt
 
 from gsseg_core.errors import GssegError
-from gsseg_core.files.npz_files import NpzArrays, UnfitError, whole_number
+from gsseg_core.files.input_files import UnfitError
+from gsseg_core.files.json_files import whole_number
+from gsseg_core.files.npz_files import NpzArrays
 from gsseg_core.scene.gaussian_scene import GaussianScene
 from gsseg_core.scene.living_scene import LivingScene
 from gsseg_core.scene.scene_delta import MAX_ID, read_similarity, similarity_entry

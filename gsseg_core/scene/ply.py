@@ -5,7 +5,6 @@ from __future__ import annotations
 import io
 import os
 from collections.abc import Iterable
-from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any, BinaryIO
 
@@ -15,67 +14,58 @@ import plyfile
 
 from gsseg_core.errors import SceneFileError, ScenePropertyError
 from gsseg_core.files.atomic import write_atomically
-from gsseg_core.files.input_files import open_input, reason
+from gsseg_core.scene.scene_file import open_scene
 from gsseg_core.text import clipped, quoted
 
 _MAX_HEADER = 1 << 20
+_PLAIN = bytes(range(128)) + b"?" * 128  # for each byte, itself if it is ASCII
 
 
 def read_vertices(path: str | os.PathLike[str], within: Path | None = None) -> npt.NDArray[np.void]:
     """Read the `vertex` element of a PLY file, ascii or binary of either byte order; others are ignored.
 
-    The structured array (N,) has one field per property in the file's order and type, native byte order, in memory.
-    Raises `SceneFileError` where the file is missing, truncated, not a PLY, or has no `vertex` element,
-    `ScenePropertyError` where a vertex property is a list, `PathNotAllowedError` where the file does not lie below
-    `within`, links followed.
+    The structured array (N,) has one field per property in the file's order and type, native byte order. Raises
+    `SceneFileError` where the file is missing, truncated, too large for the memory, not a PLY, or has no `vertex`
+    element, `ScenePropertyError` where a vertex property is a list, `PathNotAllowedError` where the file does not lie
+    below `within`, links followed.
     """
     path = Path(path)
-    ply = _parse(path, within)
-    if "vertex" not in ply:
-        found = ", ".join(element.name for element in ply) or "none"
+    elements = read_elements(path, within)
+    if "vertex" not in elements:
+        found = ", ".join(elements) or "none"
         raise SceneFileError(f"{path}: PLY has no element 'vertex' (elements found: {clipped(found)})")
-    element = ply["vertex"]
-    lists = [prop.name for prop in element.properties if isinstance(prop, plyfile.PlyListProperty)]
+    vertices = elements["vertex"]
+    lists = [name for name in vertices.dtype.names or () if vertices.dtype[name].hasobject]
     if lists:
         raise ScenePropertyError(
             f"{path}: vertex properties {clipped(', '.join(lists))} are lists; expected one number each"
         )
-    return _native(element.data)
+    return vertices
 
 
 def read_elements(path: Path, within: Path | None = None) -> dict[str, npt.NDArray[np.void]]:
     """Read all elements of a PLY by name, as `read_vertices` reads one; properties that are lists are objects."""
-    return {element.name: _native(element.data) for element in _parse(path, within)}
+    with open_scene(path, within, "a PLY file") as file:
+        try:
+            ply = _read_header(file)
+            # Text is wrapped here, since plyfile would leave its own wrapper open.
+            with io.TextIOWrapper(file, "ascii") if ply.text else file as stream:
+                return {element.name: _read_rows(element, stream, ply) for element in ply}
+        except plyfile.PlyParseError as error:
+            raise ValueError(str(error)) from error
 
 
-def _native(data: npt.NDArray[np.void]) -> npt.NDArray[np.void]:
-    """Copy rows in native byte order, so that a scene outlives changes to the memory-mapped file."""
-    native = data.dtype.newbyteorder("=")
-    if native == data.dtype and native.itemsize and not native.hasobject:
-        return _copied(data.view(np.uint8)).view(native)
-    return np.array(data, dtype=native, subok=False)
-
-
-def _copied(data: npt.NDArray[np.uint8]) -> npt.NDArray[np.uint8]:  # (B,)
-    """Copy bytes, as NumPy would copy records field after field; in two threads, since page faults take the time."""
-    copy = np.empty(data.shape, np.uint8)
-    halves = (slice(None, len(data) // 2), slice(len(data) // 2, None))
-    with ThreadPoolExecutor(2) as pool:
-        list(pool.map(lambda half: np.copyto(copy[half], data[half]), halves))
-    return copy
-
-
-def _parse(path: Path, within: Path | None) -> Any:
-    try:
-        # Text is wrapped here, since plyfile would leave its own wrapper open.
-        with open_input(path, within) as file, io.TextIOWrapper(file, "ascii") if _is_text(file) else file as stream:
-            return plyfile.PlyData.read(stream)
-    except OSError as error:
-        raise SceneFileError(f"{path}: cannot be read ({reason(error)}); expected a 3DGS PLY") from error
-    except (plyfile.PlyParseError, ValueError, TypeError, LookupError, ArithmeticError, MemoryError) as error:
-        raise SceneFileError(
-            f"{path}: truncated or not a PLY file ({reason(error)}); expected a whole 3DGS PLY"
-        ) from error
+def _read_rows(element: Any, stream: Any, ply: Any) -> npt.NDArray[np.void]:
+    dtype = element.dtype(ply.byte_order)
+    if ply.text or dtype.hasobject:
+        element._read(stream, ply.text, ply.byte_order, False)
+        rows: npt.NDArray[np.void] = element.data
+    else:
+        # plyfile would map the file into memory: one that is written anew meanwhile would end the process.
+        rows = np.empty(element.count, dtype)
+        if rows.nbytes and (size := stream.readinto(rows.view(np.uint8))) < rows.nbytes:
+            raise ValueError(f"element {quoted(element.name)} ends after {size:,} of {rows.nbytes:,} bytes")
+    return rows.astype(dtype.newbyteorder("="), copy=False)
 
 
 def is_ply(head: bytes) -> bool:
@@ -83,16 +73,18 @@ def is_ply(head: bytes) -> bool:
     return head.startswith((b"ply\n", b"ply\r"))
 
 
-def _is_text(file: BinaryIO) -> bool:
-    """Whether a PLY is text, by its header; raises `ValueError` if the file is too short for its counts."""
+def _read_header(file: BinaryIO) -> Any:
+    """Read the header of a PLY, up to the first row; raises `ValueError` if the file is too short for its counts."""
     head = file.read(_MAX_HEADER)
     if not is_ply(head):
         raise ValueError(f"begins with {head[:24]!r}, not with 'ply'" if head else "is empty")
     if b"end_header" not in head:
         raise ValueError(f"no end of its header in the first {_MAX_HEADER:,} bytes")
-    file.seek(0)
-    ply = plyfile.PlyData._parse_header(file)
-    left = os.fstat(file.fileno()).st_size - file.tell()
+    # plyfile refuses comments with letters that are not ASCII, such as a user's name.
+    header = io.StringIO(head.translate(_PLAIN).decode("ascii"), newline="")
+    ply = plyfile.PlyData._parse_header(header)
+    file.seek(header.tell())
+    left = os.fstat(file.fileno()).st_size - header.tell()
     for element in ply:
         if ply.text:
             least = 2 * len(element.properties) * element.count - 1  # a digit and what follows it
@@ -103,8 +95,7 @@ def _is_text(file: BinaryIO) -> bool:
                 f"element {quoted(element.name)} of {element.count:,} rows takes {least:,} bytes, and {left:,} are left"
             )
         left -= max(least, 0)
-    file.seek(0)
-    return bool(ply.text)
+    return ply
 
 
 def _least_bytes(prop: Any) -> int:

@@ -39,7 +39,7 @@ def read_mip_splatting(path: Path, within: Path | None = None) -> ReadScene:
     left out, so that it is not fused twice.
     """
     vertices = read_vertices(path, within)
-    check_properties(vertices, SCALES + OPACITY, str(path))
+    check_properties(vertices, (*SCALES, *OPACITY, _FILTER), str(path))
     size = vertices[_FILTER].astype(np.float64)[:, None]
     if not (size >= 0).all():
         raise SceneValueError(f"{path}: {_FILTER} holds values that are NaN or negative; expected sizes of at least 0")

@@ -11,8 +11,10 @@ import numpy as np
 import numpy.typing as npt
 
 from gsseg_core.errors import EmptySceneError, SceneDeltaError, SceneValueError
+from gsseg_core.files.input_files import UnfitError
+from gsseg_core.files.json_files import whole_number
 from gsseg_core.files.limits import LIMITS
-from gsseg_core.files.npz_files import UnfitError, open_arrays, read_json_header, whole_number, write_npz
+from gsseg_core.files.npz_files import open_arrays, read_json_header, write_npz
 from gsseg_core.scene.gaussian_scene import ACTIVATED, GaussianScene
 from gsseg_core.scene.similarity import Similarity
 from gsseg_core.text import clipped, quoted

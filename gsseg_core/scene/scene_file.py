@@ -9,9 +9,8 @@ from io import BufferedReader
 from pathlib import Path
 
 from gsseg_core.errors import SceneFileError
-from gsseg_core.files.input_files import DAMAGED, open_input, reason
+from gsseg_core.files.input_files import DAMAGED, UnfitError, open_input, reason
 from gsseg_core.files.limits import LIMITS
-from gsseg_core.files.npz_files import UnfitError
 from gsseg_core.text import clipped
 
 

@@ -15,10 +15,9 @@ import numpy.typing as npt
 from PIL import Image
 
 from gsseg_core.errors import SceneFileError
-from gsseg_core.files.input_files import check_pixels, open_input, reason
-from gsseg_core.files.json_files import kind_of, read_json
+from gsseg_core.files.input_files import UnfitError, check_pixels, open_input, reason
+from gsseg_core.files.json_files import kind_of, read_json, whole_number
 from gsseg_core.files.limits import LIMITS
-from gsseg_core.files.npz_files import UnfitError, whole_number
 from gsseg_core.scene.quaternions import from_smallest_three
 from gsseg_core.scene.scene_file import check_count, open_scene, size_of
 from gsseg_core.scene.vertices import ReadScene, logits, pack_vertices

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
-from gsseg_core.files.npz_files import UnfitError
+from gsseg_core.files.input_files import UnfitError
 from gsseg_core.scene.scene_file import open_scene
 from gsseg_core.scene.vertices import ReadScene, dc_of, log_scales, logits, pack_vertices
 

@@ -14,7 +14,7 @@ import numpy as np
 import numpy.typing as npt
 
 from gsseg_core.errors import SceneFileError
-from gsseg_core.files.npz_files import UnfitError
+from gsseg_core.files.input_files import UnfitError
 from gsseg_core.scene.moving import move
 from gsseg_core.scene.quaternions import from_smallest_three
 from gsseg_core.scene.scene_file import check_count, check_size, open_scene

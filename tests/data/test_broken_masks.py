@@ -13,6 +13,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from mask_writers import AMG_HEADER, PER_VIEW_WRITERS, WRITERS, compressed, runs
+from PIL import Image
 from test_mask_formats import HEIGHT, WIDTH, make_cameras, written
 
 from gsseg_core.data.dataset import Dataset
@@ -190,6 +191,28 @@ def test_entities_of_xml_are_never_expanded(tmp_path: Path) -> None:
         refused(tmp_path, "a.xml", "not valid XML")
 
 
+@pytest.mark.parametrize("encoding", ["gb2312", "klingon"])
+def test_xml_in_an_encoding_that_cannot_be_read_is_refused(tmp_path: Path, encoding: str) -> None:
+    make_cameras(tmp_path)
+    (tmp_path / "a.xml").write_text(f'<?xml version="1.0" encoding="{encoding}"?><annotations></annotations>')
+    refused(tmp_path, "a.xml", f"{tmp_path}/a.xml: not valid XML (", "encoding")
+
+
+@pytest.mark.parametrize("name", ["coco", "detections"])
+def test_files_that_macos_adds_beside_masks_are_left_alone(tmp_path: Path, name: str) -> None:
+    make_cameras(tmp_path)
+    folder = tmp_path / ("labels" if name == "coco" else "labels/frame_001")
+    folder.mkdir(parents=True)
+    mask = folder / ("all.json" if name == "coco" else "1.png")
+    if name == "coco":
+        mask.write_text(json.dumps(coco()))
+    else:
+        Image.new("L", (WIDTH, HEIGHT), 255).save(mask)
+    (folder / f"._{mask.name}").write_bytes(b"\0\5\x16\7\0\2\0\0Mac OS X")
+    views = [view for view in Dataset(tmp_path).views() if view.has_mask]
+    assert [view.name for view in views] == ["frame_001"] and (views[0].read_labels() == 1).any()
+
+
 def test_a_video_of_cvat_is_refused_with_what_to_do(tmp_path: Path) -> None:
     make_cameras(tmp_path)
     (tmp_path / "a.xml").write_text('<annotations><track id="0" label="a"><box/></track></annotations>')
@@ -215,7 +238,19 @@ def test_yolo_that_is_wrong_is_refused(tmp_path: Path, line: str, said: str) -> 
     refused(tmp_path, "t", f"{tmp_path}/t/frame_001.txt", said)
 
 
-@pytest.mark.parametrize("content", ["a: &a [1]\nnames: [*a]", "names: 7", "names: {a: b}", "{", "names: [[a]]", ""])
+@pytest.mark.parametrize(
+    "content",
+    [
+        "a: &a [1]\nnames: [*a]",
+        "names: 7",
+        "names: {a: b}",
+        "{",
+        "names: [[a]]",
+        "",
+        "names: !!bool x",
+        "names: !!int ''",
+    ],
+)
 def test_names_of_yolo_that_are_wrong_are_refused(tmp_path: Path, content: str) -> None:
     pytest.importorskip("yaml")
     make_cameras(tmp_path)

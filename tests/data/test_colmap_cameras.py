@@ -6,6 +6,7 @@ import math
 import struct
 from pathlib import Path
 
+import pycolmap
 import pytest
 from camera_folders import (
     FX,
@@ -118,3 +119,14 @@ def test_impossible_poses_of_a_colmap_model_are_refused(tmp_path: Path, value: f
     struct.pack_into("<4d", content, 12, *[value] * 4)  # after the number of images and the id of the first
     images.write_bytes(content)
     assert_refused(tmp_path, PoseError, "0001.jpg", words)
+
+
+def test_a_colmap_model_may_go_once_it_is_read(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    model, load = write_colmap(tmp_path / "sparse"), pycolmap.Reconstruction
+
+    def loaded_then_gone(folder: str) -> pycolmap.Reconstruction:
+        (model / "cameras.bin").unlink()
+        return load(folder)
+
+    monkeypatch.setattr(pycolmap, "Reconstruction", loaded_then_gone)
+    assert_lands(read_cameras(tmp_path)[0], 55, 35)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import shlex
 import shutil
 from collections.abc import Callable
@@ -14,9 +15,11 @@ from PIL import Image
 from small_scenes import write_dataset
 
 from gsseg_core.cli.main import main
+from gsseg_core.data.camera_files import read_cameras
 from gsseg_core.data.dataset import Dataset
 from gsseg_core.data.hints import camera_hint, mask_hint
 from gsseg_core.data.label_images import read_mask
+from gsseg_core.errors import CameraFileError
 from gsseg_core.scene.scene_formats import scene_hint
 
 
@@ -205,6 +208,17 @@ def test_a_folder_in_which_nothing_is_known_is_listed(tmp_path: Path) -> None:
     (tmp_path / "capture/photos").mkdir(parents=True)
     assert camera_hint(tmp_path / "capture/photos") == "; the folder is empty"
     assert camera_hint(tmp_path / "capture") == "; found photos/"
+
+
+def test_a_folder_that_cannot_be_listed_is_still_said_to_have_no_cameras(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def denied(path: Path) -> None:
+        raise PermissionError(errno.EACCES, "Permission denied", str(path))
+
+    monkeypatch.setattr(Path, "iterdir", denied)
+    with pytest.raises(CameraFileError, match=r"has no cameras; looked for cameras\.json"):
+        read_cameras(tmp_path)
 
 
 def test_a_folder_in_the_place_of_a_scene_leads_to_the_ply_of_most_steps(

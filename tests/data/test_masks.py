@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -12,6 +13,7 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 from PIL import Image
 
+from gsseg_core.data import label_images
 from gsseg_core.data.class_names import read_classes
 from gsseg_core.data.label_images import UNKNOWN, read_mask, write_mask
 from gsseg_core.errors import ClassesFileError, MaskFormatError, SettingsError, WriteError
@@ -34,6 +36,21 @@ def test_the_largest_number_means_unknown_only_in_its_own_encoding(tmp_path: Pat
     Image.fromarray(np.array([[255, 65534, 65535]], np.uint16)).save(tmp_path / "16.png")
     assert read_mask(tmp_path / "8.png").labels.tolist() == [[0, 254, UNKNOWN]]
     assert read_mask(tmp_path / "16.png").labels.tolist() == [[255, 65534, UNKNOWN]]
+
+
+def test_a_mask_that_is_replaced_while_it_is_read_is_one_of_the_two(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path, header = tmp_path / "mask.png", label_images.png_header
+    Image.fromarray(np.array([[0, 255]], np.uint8)).save(path)
+
+    def replaced_then_read(*start: Any) -> object:
+        Image.fromarray(np.array([[0, 255]], np.uint16)).save(tmp_path / "new.png")
+        (tmp_path / "new.png").replace(path)
+        return header(*start)
+
+    monkeypatch.setattr(label_images, "png_header", replaced_then_read)
+    assert read_mask(path).labels.tolist() == [[0, UNKNOWN]]
 
 
 @pytest.mark.parametrize("colours", [2, 5, 256])

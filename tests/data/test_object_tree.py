@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from gsseg_core.csr_rows import CSRRows
 from gsseg_core.data.object_tree import OBJECT, PART, WHOLE, ObjectTree
 from gsseg_core.errors import SettingsError
-from gsseg_core.files.npz_files import UnfitError
+from gsseg_core.files.input_files import UnfitError
 
 # A mug (1) of body and handle, on a book (2), which views often take for one; a wall (3); the background.
 PARENTS = [-1, 6, 6, -1, 1, 1, -1]

@@ -149,6 +149,25 @@ def test_a_mask_of_another_size_than_its_camera_is_refused_before_its_pixels_are
     refused(view.read_labels, GssegError, "view0.png", "8000 x 8000 pixels; expected 64 x 48")
 
 
+@pytest.mark.parametrize("name", ["view0.png", "view0.npz"])
+def test_too_little_memory_makes_no_mask_a_broken_one(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, name: str
+) -> None:
+    write_dataset(tmp_path, cameras=ring(3))
+    Image.new("L", (64, 48)).save(tmp_path / "labels/view0.png")
+    np.savez(tmp_path / "labels/view0.npz", classes=[1], probabilities=np.ones((1, 48, 64), "f4"))
+    (tmp_path / "labels" / ({"view0.png", "view0.npz"} - {name}).pop()).unlink()
+    view = Dataset(tmp_path).views()[0]
+
+    def exhausted(*_: object, **__: object) -> None:
+        raise MemoryError("Unable to allocate 1.35 GiB")
+
+    monkeypatch.setattr(np.lib.format, "read_array", exhausted)
+    monkeypatch.setattr(Image.Image, "load", exhausted)
+    with pytest.raises(MemoryError, match="Unable to allocate"):
+        view.read_labels()
+
+
 def test_foreign_text_in_a_message_is_short_printable_and_on_one_line(tmp_path: Path) -> None:
     assert clipped("a\nb\x1b[31m\u202e") == r"a\nb\x1b[31m\u202e" and clipped("käse") == "käse"
     assert len(clipped("x" * 5000)) == len(quoted("y" * 5000)) == 80

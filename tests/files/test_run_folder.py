@@ -294,7 +294,12 @@ def test_a_manifest_that_names_files_outside_the_folder_is_not_believed(tmp_path
     assert (tmp_path / "mine").read_text() == "mine"
 
 
-@pytest.mark.parametrize("text", ["{", "[]", '{"format": "gsseg-run-1"}', '{"format": "other"}', "\udc80"])
+INFINITE = (
+    """{"format": "gsseg-run-1", "staging": "", "runs": {"segment": {"run": "a", "files": {"b": {"size": 1e999}}}}}"""
+)
+
+
+@pytest.mark.parametrize("text", ["{", "[]", '{"format": "gsseg-run-1"}', '{"format": "other"}', "\udc80", INFINITE])
 def test_a_broken_manifest_makes_the_files_somebody_elses(tmp_path: Path, text: str) -> None:
     write(tmp_path, FIRST)
     (tmp_path / RUN_FILE).write_bytes(text.encode(errors="surrogateescape"))

@@ -42,7 +42,7 @@ def test_a_scene_that_the_system_does_not_let_one_look_for_is_refused(tmp_path: 
 
 def test_a_folder_that_cannot_be_listed_is_refused_as_a_scene(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(Path, "iterdir", denied)
-    refuse(tmp_path, r"is a folder\); expected a 3DGS PLY$")
+    refuse(tmp_path, r"is a folder\); expected a PLY file$")
 
 
 def denied(path: Path) -> Iterator[Path]:

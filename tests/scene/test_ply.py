@@ -163,3 +163,36 @@ def test_a_file_without_the_end_of_a_header_is_not_read_through(tmp_path: Path) 
     (tmp_path / "scene.ply").write_bytes(b"ply\nformat ascii 1.0\ncomment " + b"x" * (2 << 20))
     with pytest.raises(SceneFileError, match=r"no end of its header in the first 1,048,576 bytes"):
         read_vertices(tmp_path / "scene.ply")
+
+
+def test_comments_may_hold_letters_that_are_not_ascii(tmp_path: Path) -> None:
+    for encoding in ENCODINGS:
+        path = write_ply(tmp_path / "scene.ply", some_vertices(), encoding)
+        path.write_bytes(path.read_bytes().replace(b"\nelement", "\ncomment by Jérôme\nelement".encode(), 1))
+        np.testing.assert_array_equal(read_vertices(path), some_vertices())
+
+
+def test_a_file_that_is_written_anew_while_it_is_read_is_truncated(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path, parse = write_ply(tmp_path / "scene.ply", some_vertices(1000)), plyfile.PlyData._parse_header
+
+    def cut_then_parse(stream: object) -> object:
+        path.write_bytes(path.read_bytes()[:9000])
+        return parse(stream)
+
+    monkeypatch.setattr(plyfile.PlyData, "_parse_header", cut_then_parse)
+    with pytest.raises(SceneFileError, match=r"scene\.ply: truncated or not a PLY file \(element 'vertex' "):
+        read_vertices(path)
+
+
+@pytest.mark.parametrize("encoding", ENCODINGS)
+def test_too_little_memory_is_no_damage(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, encoding: str) -> None:
+    path = write_ply(tmp_path / "scene.ply", some_vertices(), encoding)
+
+    def exhausted(*_: object, **__: object) -> None:
+        raise MemoryError("Unable to allocate 1.35 GiB")
+
+    monkeypatch.setattr(np, "empty", exhausted)
+    with pytest.raises(SceneFileError, match=r"scene\.ply: memory is not enough \(Unable to allocate 1\.35 GiB\)"):
+        read_vertices(path)

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import dataclasses
 import resource
+import subprocess
+import sys
 from pathlib import Path
 
 import numpy as np
@@ -363,3 +365,14 @@ def test_real_scenes_load_and_save_exactly(real_data: Path, tmp_path: Path, name
     assert rgb.min() >= 0 and rgb.max() <= 1 and rgb.std() > 0.05
     scene.save(tmp_path / "out.ply")
     np.testing.assert_array_equal(read_vertices(tmp_path / "out.ply"), scene.vertices)
+
+
+def test_reading_a_scene_loads_no_kernels(tmp_path: Path) -> None:
+    path = write_ply(tmp_path / "scene.ply", random_vertices())
+    program = f"""
+import sys
+from gsseg_core.scene.gaussian_scene import GaussianScene
+GaussianScene.load({str(path)!r})
+sys.exit("numba" in sys.modules or "scipy" in sys.modules)
+"""
+    subprocess.run([sys.executable, "-c", program], check=True)

@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
+import plyfile
 import pytest
 import scene_files
 import torch
@@ -298,6 +299,11 @@ def test_a_variant_of_ply_that_lacks_properties_is_refused_as_any_other(tmp_path
     vertices = np.zeros(3, [("x", "f4"), ("filter_3D", "f4")])
     with pytest.raises(ScenePropertyError, match=r"a\.ply: not a 3DGS scene, lacks the vertex properties scale_0"):
         GaussianScene.load(write_ply(tmp_path / "a.ply", vertices))
+    elsewhere = [plyfile.PlyElement.describe(some_scene().vertices, "vertex")]
+    elsewhere += [plyfile.PlyElement.describe(np.zeros(1, [("filter_3D", "f4")]), "settings")]
+    plyfile.PlyData(elsewhere).write(str(tmp_path / "a.ply"))
+    with pytest.raises(ScenePropertyError, match=r"a\.ply: not a 3DGS scene, lacks the vertex properties filter_3D"):
+        GaussianScene.load(tmp_path / "a.ply")
 
 
 def test_packed_vertices_are_laid_out_as_trainers_do() -> None:

@@ -88,8 +88,9 @@ def _load(path: Path, within: Path | None) -> pycolmap.Reconstruction:
         except Exception as error:  # whatever its C++ parser makes of a broken file
             why = clipped(str(error).strip().replace(folder, str(path)), 300)
             raise CameraFileError(f"{path}: not a readable COLMAP model ({why})") from error
-    size = 8 + sum(24 + 8 * len(lens.params) for lens in model.cameras.values())
-    if suffix == ".bin" and cameras.stat().st_size < size:
+        size = 8 + sum(24 + 8 * len(lens.params) for lens in model.cameras.values())
+        found = (Path(folder) / cameras.name).stat().st_size
+    if suffix == ".bin" and found < size:
         raise CameraFileError(f"{cameras}: is truncated; expected at least {size} bytes")
     return model
 

@@ -51,7 +51,7 @@ def read_cvat(place: Place) -> MaskSet:
     parser.CharacterDataHandler = reader.text
     try:
         parser.Parse(place.read(path), True)
-    except expat.ExpatError as cause:
+    except (expat.ExpatError, ValueError, LookupError) as cause:  # The others are of encodings that expat has not.
         raise MaskFormatError(f"{path}: not valid XML ({cause}); expected an export as CVAT for images 1.1") from cause
     names = dict.fromkeys(reader.names)
     names |= dict.fromkeys(found.name for image in reader.images.values() for found in image.annotations)

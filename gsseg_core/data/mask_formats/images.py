@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import numpy.typing as npt
 
-from gsseg_core.data.label_images import mask_header, read_mask
+from gsseg_core.data.label_images import read_mask
 from gsseg_core.data.mask_formats.shapes import check_fit, scaled
 from gsseg_core.errors import MaskFormatError
 from gsseg_core.files.input_files import open_image
@@ -23,9 +23,8 @@ def read_label_image(path: Path, camera: Camera, within: Path | None = None) -> 
     Before any pixel is read, raises `MaskFormatError` where it is missing, broken or another kind of image,
     `MaskSizeError` where it has another shape than the camera's, `PathNotAllowedError` where it lies outside `within`.
     """
-    header = mask_header(path, within)
-    check_fit(header.width, header.height, camera, str(path))
-    return scaled(read_mask(path, within).labels, camera)
+    mask = read_mask(path, within, lambda width, height: check_fit(width, height, camera, str(path)))
+    return scaled(mask.labels, camera)
 
 
 def paint_objects(masks: Iterable[tuple[int, Path]], camera: Camera, within: Path | None) -> npt.NDArray[np.int32]:

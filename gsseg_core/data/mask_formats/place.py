@@ -59,13 +59,13 @@ class Place:
 
     @cached_property
     def entries(self) -> list[Path]:
-        """Files and folders in it, sorted, without gsseg's own `supervises.json`; none if it is a file."""
+        """Files and folders in it, by `list_folder`, without gsseg's own `supervises.json`; none if it is a file."""
         return [path for path in list_folder(self.path, MaskFormatError, self.within) if path.name != SUPERVISES]
 
     @property
     def folders(self) -> list[Path]:
-        """Folders in it that are not hidden."""
-        return [path for path in self.entries if path.is_dir() and not path.name.startswith(".")]
+        """Folders among its entries."""
+        return [path for path in self.entries if path.is_dir()]
 
     def view_of(self, name: str) -> str | None:
         """Find the view that a name belongs to by the function `view_of`, and keep names that belong to none."""
