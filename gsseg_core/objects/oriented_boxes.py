@@ -21,7 +21,7 @@ All of this turns, moves and scales with the scene, and no direction is taken fo
 from __future__ import annotations
 
 from dataclasses import dataclass
-from itertools import pairwise, product
+from itertools import product
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -150,11 +150,11 @@ def object_boxes(scene: GaussianScene, result: Segmentation) -> dict[int, Orient
     StateMismatchError
         The segmentation belongs to another scene.
     """
+    from gsseg_core.spatial.row_order import rows_by_label
+
     result.require(scene)
-    order, confidence = np.argsort(result.labels, kind="stable"), result.confidence
-    bounds = np.searchsorted(result.labels[order], np.arange(1, result.num_classes + 1))
-    members = {k: order[first:last] for k, (first, last) in enumerate(pairwise(bounds.tolist()), start=1)}
-    return {k: class_box(scene, own, confidence[own]) for k, own in members.items() if len(own)}
+    members, confidence = rows_by_label(result.labels), result.confidence
+    return {k: class_box(scene, own, confidence[own]) for k, own in members.items() if k > 0}
 
 
 def without_floaters(points: Array, weights: Array) -> npt.NDArray[np.bool_]:
