@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import argparse
+from statistics import median
+from typing import Any
 
 from gsseg_core.cli.shared import LABELS, add_collision, add_format, add_scene, labels_path, load_kernels
 from gsseg_core.cli.terminal import note, tell
@@ -22,6 +24,8 @@ EXAMPLES = """
   gsseg segment scene.ply --data DATASET --out out --learner votes --views 20
   gsseg segment scene.ply --data DATASET --out out --format usd --collision
 """
+_OWN_IDS = "where an id holds in its own view only, as SAM's do, it takes --ids per-view"
+_HALF = 0.5  # share of its pixels in which half of the masks agree less with the others, whatever their errors
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -69,6 +73,7 @@ def run(options: argparse.Namespace) -> int:
     """Segment, and print a summary."""
     # The rasteriser's kernels load with the pipeline; `gsseg --help` need not wait for them.
     from gsseg_core import pipeline
+    from gsseg_core.errors import UnknownLabelError
 
     outer = None if options.no_filter else options.refine
     refine = RefineSettings(
@@ -76,19 +81,33 @@ def run(options: argparse.Namespace) -> int:
         filter=outer == "paper", carve=outer == "carve",
     )  # fmt: skip
     load_kernels(options.quiet, options.device)
-    with progress_bars(options.quiet) as progress:
-        report = pipeline.segment(
-            options.scene, options.data, options.out, labels=labels_path(options), learner=options.learner,
-            views=options.views, refine=refine, graph=not options.no_graph, device=options.device,
-            memory_budget=None if options.memory_budget is None else options.memory_budget << 20,
-            seed=options.seed, scheduler=options.scheduler, ids=options.ids, granularity=options.granularity,
-            label_map=options.label_map,
-            scene_format=options.format, collision=options.collision, align=options.align,
-            dataparser=options.dataparser, quality=options.quality, progress=progress,
-        )  # fmt: skip
-    from gsseg_core.report.findings import NO_OBJECTS, has_objects
+    try:
+        with progress_bars(options.quiet) as progress:
+            report = pipeline.segment(
+                options.scene, options.data, options.out, labels=labels_path(options), learner=options.learner,
+                views=options.views, refine=refine, graph=not options.no_graph, device=options.device,
+                memory_budget=None if options.memory_budget is None else options.memory_budget << 20,
+                seed=options.seed, scheduler=options.scheduler, ids=options.ids, granularity=options.granularity,
+                label_map=options.label_map,
+                scene_format=options.format, collision=options.collision, align=options.align,
+                dataparser=options.dataparser, quality=options.quality, progress=progress,
+            )  # fmt: skip
+    except UnknownLabelError as error:
+        raise UnknownLabelError(f"{error}{'' if options.ids else f'; {_OWN_IDS}'}") from error
     from gsseg_core.text import segment_summary
 
+    _note_doubts(options, report)
+    tell(segment_summary(report, options.out))
+    return 0
+
+
+def _note_doubts(options: argparse.Namespace, report: dict[str, Any]) -> None:
+    """Warn of what makes a whole run worthless."""
+    from gsseg_core.report.findings import NO_OBJECTS, has_objects
+
+    known = [view["reliability"] for view in report["views"].get("reliability", ()) if view["reliability"] is not None]
+    if known and median(known) < _HALF and report["settings"]["ids"] == "global":
+        note(f"most masks contradict the others: {_OWN_IDS}")
     agreement = report["frame"]["agreement"]
     if agreement and not agreement["agrees"]:  # None where it is undecided.
         looks = "does not look" if agreement["agrees"] is False else "hardly looks"
@@ -98,5 +117,3 @@ def run(options: argparse.Namespace) -> int:
         )
     if not has_objects(report):
         note(f"no Gaussian is part of an object: {NO_OBJECTS}")
-    tell(segment_summary(report, options.out))
-    return 0

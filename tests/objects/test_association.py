@@ -275,6 +275,19 @@ def test_objects_found_are_learnt_as_well_as_with_true_ids() -> None:
     assert score.ari == pytest.approx(1.0)
 
 
+def test_who_takes_ids_of_each_views_own_for_classes_is_told_of_per_view(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    data = write_dataset(tmp_path / "data", SCENE, TRUTH, ring(9), NAMES)
+    for i, view in enumerate(Dataset(data).views()):
+        write_mask(data / "own" / f"{view.name}.png", (view.read_labels() + i) % 7 + 1, 8)
+    inputs = [f"{data}/scene.ply", "--data", str(data), "--quiet", "--labels", "own", "--out", f"{tmp_path}/out"]
+    assert main(["segment", *inputs]) == 2 and "takes --ids per-view" in capsys.readouterr().err
+    (data / "classes.json").unlink()
+    assert main(["segment", *inputs]) == 0 and "takes --ids per-view" in capsys.readouterr().err
+    assert main(["segment", *inputs, "--ids", "per-view"]) == 0 and "per-view" not in capsys.readouterr().err
+
+
 def test_objects_that_end_without_a_gaussian_are_listed_apart_and_ids_stay(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
