@@ -60,7 +60,7 @@ class CameraImages:
         compressed: bool = False,
     ) -> None:
         self._node, self._outputs, self._live, self._group = node, outputs, live, group
-        self._camera, self._kind, self._topic = camera.name, Image, node.resolve_topic_name(camera.topic("image"))
+        self._camera, self._kind, self._topic = camera.name, Image, camera.topic("image")
         if compressed:
             self._kind, self._topic = CompressedImage, compressed_topic(node, camera.topic("image"))
         self.pairing = Pairing(camera.poses(), stream=camera.name)
@@ -96,7 +96,7 @@ class CameraImages:
 
     def _arrived(self, message: Any) -> None:
         stamp, frame_id, size = stamp_ns(message.header.stamp), message.header.frame_id, len(message.data)
-        self.pairing.add_mask(stamp, (self._topic, message), frame_id, size=size)
+        self.pairing.add_mask(stamp, (self._node.resolve_topic_name(self._topic), message), frame_id, size=size)
         self._hand_over()
 
     def _hand_over(self) -> None:

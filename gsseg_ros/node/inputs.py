@@ -189,12 +189,13 @@ class Inputs:
 
     def _detections_of(self, camera: CameraStreams, settings: Settings) -> DetectionsInput:
         """Make the input of detections; their type, and so whether a mask belongs to them, turns out later."""
-        topic = self._node.resolve_topic_name(camera.topic(settings.detections_topic))
+        name = camera.topic(settings.detections_topic)
+        topic = self._node.resolve_topic_name(name)
         self.arrivals[topic], self.roles[topic] = (0, self.started), "detections"
         return DetectionsInput(
             self._node,
             topic,
-            lambda kind, take: self._listen(None, kind, "detections", topic, take),
+            lambda kind, take: self._listen(None, kind, "detections", name, take),
             lambda take: self._listen(None, mask_class(settings), "mask", camera.topic("mask"), take),
             camera.on_mask,
             self._lose,

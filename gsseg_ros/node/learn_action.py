@@ -130,7 +130,7 @@ class LearnAction:
         return dataset
 
     def _report(self, session: LiveSession, outcome: Outcome, run: Run) -> SegmentationReport:
-        settings = self._workspace.settings
+        settings, version = self._workspace.settings, session.version
         raw = session.segmentation(UNREFINED, run.watch)
         selection = Selection(session, raw, sorted(raw.class_names), 0.0, settings.scene_to_map)
         with run.watch.stage("boxes"):
@@ -139,6 +139,8 @@ class LearnAction:
         with outputs.turn(run.revision, lambda: self._workspace.holds(run)) as newest:
             if newest:
                 outputs.publish_objects(objects)
+        if session.version != version:  # Views that came meanwhile are not in these objects.
+            self._show()
         report = report_message(run, selection, UNREFINED, settings.map_frame)
         if outcome.rejected:
             reasons = sorted(set(outcome.rejected.values()))

@@ -266,9 +266,9 @@ class SegmentNode(LifecycleNode):
         inputs, outputs = self.inputs, self._outputs  # In another thread the node may be cleaned up meanwhile.
         if not self.workspace.active or inputs is None or outputs is None:
             return
-        self._out_of_place = False
         session = self.workspace.loaded
         if session is None or not session.has_codes:
+            self._out_of_place = False
             return
         following = session.num_views
         if isinstance(session, LivingSession):
@@ -281,6 +281,7 @@ class SegmentNode(LifecycleNode):
             inputs.live.show_objects()
         else:
             self._requests.publish_again(outputs.latched)
+        self._out_of_place = not self.workspace.active  # Deactivated meanwhile, it has published nothing.
 
     def _show_change(self) -> None:
         if (inputs := self.inputs) is not None:

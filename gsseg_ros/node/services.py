@@ -153,7 +153,7 @@ class Services:
         """Segment the scene, answer with what was asked for, and publish all classes, unless that is not wanted."""
         outputs = self._outputs()
         with self.workspace.run("segment") as run:
-            overlay = Image()
+            overlay, version = Image(), self.workspace.session.version
             selection, refine = self._select(request, run)
             settings = self.workspace.settings  # As the selection has them: the scene may have been put elsewhere.
             self.workspace.number(run)
@@ -186,6 +186,8 @@ class Services:
                         outputs.publish_overlay(overlay)
                     outputs.publish_report(report)
                     outputs.latched = Segment.Request(**{name: getattr(request, name) for name in _PUBLISHED})
+            if selection.session.version != version:  # Views that came meanwhile are not in these objects.
+                self.show()
             # What is published is serialised by now.
             report.classes = [summary for summary in report.classes if summary.class_id in selection.chosen]
             response.report = report

@@ -1,0 +1,107 @@
+"""Sequences of a robot's day: what happens in the middle of something else, and what is left afterwards."""
+
+from __future__ import annotations
+
+import threading
+from types import SimpleNamespace
+from typing import Any
+
+import pytest
+from ros_fixtures import parameters_fixture, root_fixture  # noqa: F401
+from ros_helpers import Ros, ros_fixture, wait_until  # noqa: F401
+from ros_node_here import NodeHere, node_here
+from ros_robot import LATCHED
+from small_scenes import clean_views
+
+pytest.importorskip("gsseg_msgs.msg", reason="gsseg_msgs is not installed")
+
+from gsseg_msgs.action import Learn
+from gsseg_msgs.msg import ObjectArray
+from rclpy.lifecycle import TransitionCallbackReturn
+from rclpy.parameter import Parameter
+from sensor_msgs.msg import PointCloud2
+
+from gsseg_ros.node import live_outputs, services
+from gsseg_ros.node.reports import Selection
+from gsseg_ros.node.segment_node import SegmentNode
+
+SIDES = ("left", "right")
+
+
+def test_a_scene_that_was_moved_just_before_a_deactivate_is_published_there_once_the_node_is_active(
+    ros: Ros, parameters: dict[str, Any], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    clouds = ros.collect(PointCloud2, "/gsseg/cloud", LATCHED)
+    with node_here(ros, parameters) as here:
+        here.fuse(clean_views(3))
+        here.done("segment")
+        ros.wait_until(lambda: clouds, "the first cloud")
+        places, tries = here.node._requests.turns._places, []
+        monkeypatch.setattr(services, "explain", lambda node, error: tries.append(error) or str(error))
+        while places.acquire(blocking=False):
+            pass
+        here.node.set_parameters([Parameter("scene_to_map.translation", value=[0.02, 0.0, 0.0])])
+        wait_until(lambda: tries, "the node to find that too many requests are at work")
+        here.node.trigger_deactivate()
+        places.release(services.AT_WORK + services.WAITING)
+        wait_until(lambda: "placement" not in {thread.name for thread in threading.enumerate()}, "it to give up")
+        here.node.trigger_activate()
+        ros.wait_until(lambda: len(clouds) > 1, "the cloud from where the scene lies now")
+        assert clouds[-1].data == here.done("segment", publish_nothing=True).cloud.data != clouds[0].data
+
+
+def segment(here: NodeHere) -> None:
+    here.done("segment")
+
+
+def learn(here: NodeHere) -> None:
+    ended: list[str] = []
+    goal = SimpleNamespace(
+        request=Learn.Goal(learner="votes"), is_active=True, is_cancel_requested=False,
+        publish_feedback=lambda message: None, succeed=lambda: ended.append("succeeded"), abort=lambda: None,
+    )  # fmt: skip
+    here.node._learn._execute(goal)
+    assert ended == ["succeeded"]
+
+
+@pytest.mark.parametrize("work", [segment, learn])
+def test_views_that_come_while_a_run_works_are_in_the_objects_in_the_end(
+    ros: Ros, parameters: dict[str, Any], monkeypatch: pytest.MonkeyPatch, work: Any
+) -> None:
+    monkeypatch.setattr(live_outputs, "OBJECTS_PERIOD", 0.0)
+    arrays, boxed, came = ros.collect(ObjectArray, "/gsseg/objects", LATCHED), Selection.objects, []
+
+    def objects(selection: Selection, header: Any, revision: int) -> ObjectArray:
+        if revision and not came:
+            came.append(here.fuse(clean_views(4, turn=0.5)))
+        return boxed(selection, header, revision)
+
+    with node_here(ros, parameters) as here:
+        wait_until(lambda: here.outputs.wants_objects, "somebody who listens")
+        here.fuse(clean_views(2))
+        monkeypatch.setattr(Selection, "objects", objects)
+        work(here)
+        here.inputs.live.tick()
+        ros.wait_until(lambda: arrays and arrays[-1].revision == 0, "objects of all views")
+    assert [array.revision > 0 for array in arrays][-2:] == [True, False]
+
+
+def test_topics_of_two_cameras_can_be_exchanged_by_remapping(ros: Ros, parameters: dict[str, Any]) -> None:
+    values = {**parameters, "cameras": ["left", "right"], "detections_topic": "found", "ids": "given"}
+    rules = [f"{one}/{name}:={two}/{name}" for name in ("image", "found") for one, two in (SIDES, SIDES[::-1])]
+    node = SegmentNode(
+        context=ros.context,
+        use_global_arguments=False,
+        cli_args=["--ros-args", *(text for rule in rules for text in ("-r", rule))],
+        parameter_overrides=[Parameter(n, value=v if isinstance(v, list) else str(v)) for n, v in values.items()],
+    )
+    try:
+        assert node.trigger_configure() == node.trigger_activate() == TransitionCallbackReturn.SUCCESS
+        assert node.inputs is not None
+        for images, detections, other in zip(node.inputs._images, node.inputs.detections, SIDES[::-1], strict=True):
+            images._listen(True)
+            assert images._subscription is not None
+            heard = [images._subscription, detections._listen(PointCloud2, lambda topic, message: None)]
+            assert [one._subscription.topic_name for one in heard] == [f"/{other}/image", f"/{other}/found"]
+    finally:
+        node.close()
