@@ -38,10 +38,8 @@ def is_rectified(setting: str, *topics: str) -> bool:
 def intrinsics_from_info(info: CameraInfo, topic: str) -> tuple[npt.NDArray[np.float64], int, int]:
     """Read `K` (3, 3) in pixels, width and height of a pinhole camera, of the image that is cut out and binned.
 
-    Raises
-    ------
-    IntrinsicsError
-        The lens is distorted, the size zero, what is cut out not in the image, or `k` not that of a pinhole camera.
+    Raises `IntrinsicsError`: the lens is distorted, the size zero, what is cut out not in the image, or `k` not that of
+    a pinhole camera.
     """
     if np.any(info.d):
         raise IntrinsicsError(
@@ -54,10 +52,7 @@ def intrinsics_from_info(info: CameraInfo, topic: str) -> tuple[npt.NDArray[np.f
 def image_size(info: CameraInfo, topic: str) -> tuple[int, int]:
     """Width and height of the images of a camera_info: its `roi`, in which `binning` makes one pixel of several.
 
-    Raises
-    ------
-    IntrinsicsError
-        There is no pixel, or `roi` is not in the image.
+    Raises `IntrinsicsError`: there is no pixel, or `roi` is not in the image.
     """
     _, _, width, height = _window(info, topic)
     size = width // max(info.binning_x, 1), height // max(info.binning_y, 1)
@@ -75,10 +70,7 @@ def camera_from_messages(
 ) -> Camera:
     """Build the scene's camera from a camera_info (of `topic`) and the pose of the optical frame in the map, in metres.
 
-    Raises
-    ------
-    IntrinsicsError, PoseError
-        The camera_info or the pose cannot be used.
+    Raises `IntrinsicsError`, `PoseError`: the camera_info or the pose cannot be used.
     """
     K, width, height = intrinsics_from_info(info, topic)
     return Camera(name, width, height, K, similarity.world_to_camera(camera_in_map))
@@ -99,14 +91,9 @@ def camera_of_image(
     Of a rectified image, `p` counts, as image_proc publishes such images beside the raw camera's `d` and `k`. Of one
     with distortion it is the pinhole view that image_proc would make, by `d`, `k`, `r` and `p`; without `p`, that of
     `gsseg_core.scene.undistortion`. The optical frame is that of the rectified image, as `image_geometry` has it, and
-    the fourth column of `p`, the baseline of a stereo pair, does not count.
-
-    Raises
-    ------
-    IntrinsicsError
-        The camera_info is impossible, or of an unknown lens.
-    MaskSizeError
-        Width and height are not in the proportion of those in the camera_info.
+    the fourth column of `p`, the baseline of a stereo pair, does not count. Raises `IntrinsicsError`: the camera_info
+    is impossible, or of an unknown lens; `MaskSizeError`: width and height are not in the proportion of those in the
+    camera_info.
     """
     projection = np.reshape(info.p, (3, 4))[:, :3]
     has_projection = projection[0, 0] != 0

@@ -48,13 +48,7 @@ class ChildNode:
 
     @property
     def done(self) -> bool:
-        """Whether it has ended as it should.
-
-        Raises
-        ------
-        ChildError
-            It has failed.
-        """
+        """Whether it has ended as it should. Raises `ChildError`: it has failed."""
         code = self._process.poll()
         if code:
             lines = self.log.read_text(errors="replace").split("\n")
@@ -79,19 +73,7 @@ class ChildNode:
 class ChildNodes:
     """Starts nodes, and ends them with the body of a `with` statement, whatever ends that.
 
-    Parameters
-    ----------
-    folder : path
-        For the logs.
-
-    Attributes
-    ----------
-    domain_id : int
-        ROS domain of the children.
-    environment : dict
-        What makes a process one of theirs; `ROS_DOMAIN_ID` and so on.
-    logs : list of pathlib.Path
-        One for each child so far.
+    `environment` is what makes a process one of theirs: `ROS_DOMAIN_ID` and so on. Logs go into the folder.
     """
 
     def __init__(self, folder: Path) -> None:
@@ -140,12 +122,8 @@ class ChildNodes:
 def claimed_domain(candidates: Iterable[int]) -> tuple[int, socket.socket]:
     """Take the first ROS domain in which no process of this machine is, until the socket that is returned closes.
 
-    Who only looks, and joins later, may meet another there who did the same meanwhile.
-
-    Raises
-    ------
-    ChildError
-        There is none.
+    Who only looks, and joins later, may meet another there who did the same meanwhile. Raises `ChildError`: there is
+    none.
     """
     for domain in candidates:
         claim = _bound(domain, _CLAIMANT)

@@ -22,6 +22,7 @@ from gsseg_core.data.label_images import UNKNOWN, in_bits
 from gsseg_core.errors import MaskFormatError, PoseError, SceneValueError
 from gsseg_core.files.limits import MAX_LABEL
 from gsseg_core.scene.camera import Camera, rigid_motion
+from gsseg_ros.errors import TooManyPixelsError
 from gsseg_ros.frames import quaternion_from_rotation, rotation_from_quaternion
 
 _NS = 1_000_000_000
@@ -42,6 +43,9 @@ _PICTURE_ENCODINGS: dict[str, tuple[npt.DTypeLike, int]] = {
     "rgb8": (np.uint8, 3), "bgr8": (np.uint8, 3), "rgba8": (np.uint8, 4), "bgra8": (np.uint8, 4),
     "mono8": (np.uint8, 1), "16UC1": (np.uint16, 1), "32FC1": (np.float32, 1),
 }  # fmt: skip
+
+# Which channels are red, green and blue.
+_CHANNELS = {"rgb8": [0, 1, 2], "rgba8": [0, 1, 2], "bgr8": [2, 1, 0], "bgra8": [2, 1, 0], "mono8": [0, 0, 0]}
 
 # Field, its type in the message, its type here. RViz and PCL want 0x00RRGGBB in the bits of a float.
 _CLOUD_FIELDS = (
@@ -80,12 +84,8 @@ def labels_from_image(message: Image, topic: str) -> npt.NDArray[np.int32]:
     """Read the labels (H, W) of a mask message, `UNKNOWN` (-1) where a pixel has none.
 
     Encodings are mono8 and 8UC1 (255 is unknown), mono16 and 16UC1 (65535), 16SC1 (whatever is negative) and 32SC1
-    (-1), of either byte order, with rows of any `step`.
-
-    Raises
-    ------
-    MaskFormatError
-        Another encoding, a size of zero, data too short, or a label out of range.
+    (-1), of either byte order, with rows of any `step`. Raises `MaskFormatError`: another encoding, a size of zero,
+    data too short, or a label out of range.
     """
     require_encoding(message, topic, MASK_ENCODINGS, "labels as ")
     kind, unknown = MASK_ENCODINGS[message.encoding]
@@ -99,6 +99,16 @@ def labels_from_image(message: Image, topic: str) -> npt.NDArray[np.int32]:
     return labels
 
 
+def require_size(message: Any, max_pixels: int, topic: str) -> None:
+    """Refuse an Image or a CameraInfo by its size, before anything of that size is made.
+
+    Raises `TooManyPixelsError`: it has more pixels than the parameter max_pixels allows.
+    """
+    if message.width * message.height > max_pixels:
+        size = f"{message.width} x {message.height}"
+        raise TooManyPixelsError(f"{topic}: is {size}; expected {max_pixels} pixels at most (parameter max_pixels)")
+
+
 def require_encoding(message: Image, topic: str, known: Collection[str], what: str = "") -> None:
     """Refuse an image whose encoding is not among those known, with `MaskFormatError`."""
     if message.encoding not in known:
@@ -109,10 +119,7 @@ def require_encoding(message: Image, topic: str, known: Collection[str], what: s
 def picture_from_image(message: Image, topic: str) -> npt.NDArray[Any]:
     """Read a picture as it is: (H, W) or (H, W, C), uint8, or uint16 and float32 as 16UC1 and 32FC1 are.
 
-    Raises
-    ------
-    MaskFormatError
-        Another encoding, a size of zero, or data too short.
+    Raises `MaskFormatError`: another encoding, a size of zero, or data too short.
     """
     require_encoding(message, topic, _PICTURE_ENCODINGS)
     kind, channels = _PICTURE_ENCODINGS[message.encoding]
@@ -120,13 +127,21 @@ def picture_from_image(message: Image, topic: str) -> npt.NDArray[Any]:
     return pixels.reshape(message.height, message.width, channels) if channels > 1 else pixels
 
 
+def color_from_image(message: Image, topic: str) -> npt.NDArray[np.uint8]:
+    """Read a camera's picture (H, W, 3) uint8, RGB; encodings are rgb8, bgr8, rgba8, bgra8 and mono8.
+
+    Raises `MaskFormatError`: another encoding, a size of zero, or data too short.
+    """
+    require_encoding(message, topic, _CHANNELS)
+    pixels = picture_from_image(message, topic).reshape(message.height, message.width, -1)
+    picture: npt.NDArray[np.uint8] = pixels[..., _CHANNELS[message.encoding]]
+    return picture
+
+
 def pixels_of(message: Image, kind: np.dtype[Any], topic: str, channels: int = 1) -> npt.NDArray[Any]:
     """Read the numbers (H, W * channels) of an image, of either byte order, with rows of any `step`.
 
-    Raises
-    ------
-    MaskFormatError
-        A size of zero, or data too short.
+    Raises `MaskFormatError`: a size of zero, or data too short.
     """
     width, height, step = message.width, message.height, message.step
     if width < 1 or height < 1:
@@ -144,10 +159,7 @@ def pixels_of(message: Image, kind: np.dtype[Any], topic: str, channels: int = 1
 def matrix_from_pose(pose: Pose, topic: str) -> npt.NDArray[np.float64]:
     """Turn a pose into a rigid motion (4, 4), in metres.
 
-    Raises
-    ------
-    PoseError
-        A number is NaN or infinite, or the quaternion is not of length 1.
+    Raises `PoseError`: a number is NaN or infinite, or the quaternion is not of length 1.
     """
     return _matrix(pose.position, pose.orientation, topic)
 
@@ -196,10 +208,7 @@ def mask_image(
 ) -> Image:
     """Write labels (H, W) as mono8 or mono16 (`bits` 8 or 16), `UNKNOWN` (-1) as 255 or 65535.
 
-    Raises
-    ------
-    MaskFormatError
-        A label does not fit.
+    Raises `MaskFormatError`: a label does not fit.
     """
     values = in_bits(labels, bits, "mask image").astype(f"<u{bits // 8}", copy=False)
     return plain_image(values, f"mono{bits}", header)
@@ -257,10 +266,7 @@ def cloud(
 ) -> PointCloud2:
     """Write points (M, 3) in metres with colour, class id and confidence; M may be 0, which clears a latched cloud.
 
-    Raises
-    ------
-    SceneValueError
-        Shapes do not go together, or a label is negative.
+    Raises `SceneValueError`: shapes do not go together, or a label is negative.
     """
     shapes = [np.shape(values) for values in (points, rgb, labels, confidence)]
     count = len(labels)
@@ -332,10 +338,7 @@ def _cloud_of(
 def arrays_from_cloud(message: PointCloud2, topic: str = "cloud") -> CloudArrays:
     """Read what `cloud` wrote; other fields, other offsets, padding and either byte order are welcome.
 
-    Raises
-    ------
-    SceneValueError
-        A field is missing or of another type, or the data are too short.
+    Raises `SceneValueError`: a field is missing or of another type, or the data are too short.
     """
     found = {field.name: (field.datatype, field.offset) for field in message.fields}
     wanted = {name: datatype for name, datatype, _ in _CLOUD_FIELDS}

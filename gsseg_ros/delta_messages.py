@@ -23,10 +23,7 @@ _SIZES = {"means": 3, "quats": 4, "scales": 3, "opacities": 1}
 def delta_from_message(message: SceneDeltaMessage) -> SceneDelta:
     """Read a change of a scene.
 
-    Raises
-    ------
-    InvalidRequestError
-        Its arrays do not fit each other, or hold impossible values.
+    Raises `InvalidRequestError`: its arrays do not fit each other, or hold impossible values.
     """
     try:
         removed, ids, groups = (_numbers(message, name) for name in ("removed", "added_ids", "added_groups"))

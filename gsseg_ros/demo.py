@@ -46,17 +46,9 @@ COMPARED_VIEWS = 3
 
 
 def run_demo(out: Path, nodes: ChildNodes, *, seed: int = 0, rate: float = 10.0, progress: Progress = silent) -> str:
-    """Build the scene, replay its masks to a node, learn, segment, look, export; and say how well that went.
+    """Build the scene, replay its masks to a node, learn, segment, look, export; return how well that went, as tables.
 
-    Returns
-    -------
-    str
-        Tables for the terminal.
-
-    Raises
-    ------
-    GssegError
-        A node could not be started or asked; its log says more.
+    Raises `GssegError`: a node could not be started or asked; its log says more.
     """
     watch = Stopwatch()
     with watch.stage("build the scene"):

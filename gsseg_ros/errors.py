@@ -19,12 +19,8 @@ from gsseg_core.errors import (
 class SegmentationError(GssegError):
     """The node answered that a request failed.
 
-    Attributes
-    ----------
-    code : int
-        Error code of the answer; see msg_defs/README.md.
-    name : str
-        Name of its constant, such as "NO_SCENE": the same for every request.
+    `code` is the error code of the answer, see msg_defs/README.md; `name` that of its constant, such as "NO_SCENE",
+    which is the same for every request.
     """
 
     def __init__(self, code: int, name: str, message: str) -> None:

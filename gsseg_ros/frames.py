@@ -34,10 +34,8 @@ class Similarity(similarity.Similarity):
     ) -> Similarity:
         """Build it from the parameters `scene_to_map.scale`, `.translation` (metres) and `.rotation` (any length).
 
-        Raises
-        ------
-        SettingsError
-            A number is missing, NaN or infinite, the scale is not positive, or the quaternion is zero.
+        Raises `SettingsError`: a number is missing, NaN or infinite, the scale is not positive, or the quaternion is
+        zero.
         """
         if not (np.isfinite(scale) and scale > 0):
             raise SettingsError(f"scene_to_map.scale is {scale:g}; expected a positive number of metres per scene unit")
@@ -83,11 +81,8 @@ def pose_from_parameters(
 ) -> Array:
     """Build a rigid motion (4, 4) from the parameters `<name>.translation` (metres) and `<name>.rotation` (any length).
 
-    Raises
-    ------
-    SettingsError
-        A number is missing, NaN or infinite, the quaternion zero, or the translation too large; the message names the
-        parameter.
+    Raises `SettingsError`: a number is missing, NaN or infinite, the quaternion zero, or the translation too large; the
+    message names the parameter.
     """
     for part, values, size in (("translation", translation, 3), ("rotation", quaternion_xyzw, 4)):
         if len(values) != size or not np.isfinite(values).all():

@@ -60,13 +60,7 @@ def point_message(
 
 
 def box_from_object(message: Object) -> OrientedBox:
-    """Read the box of an object, in the frame and the metres of the message.
-
-    Raises
-    ------
-    PoseError
-        Its pose is none.
-    """
+    """Read the box of an object, in the frame and the metres of the message. Raises `PoseError`: its pose is none."""
     pose, size, center = message.box_pose, message.box_size, message.center
     matrix = matrix_from_pose(pose, f"object '{message.name}': box_pose")
     return OrientedBox(

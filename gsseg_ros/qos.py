@@ -53,10 +53,7 @@ def reliable(depth: int = 100) -> QoSProfile:
 def clear_overrides(topic: str) -> Iterator[None]:
     """Make what rclpy raises in the body for a parameter qos_overrides that cannot be used one clear error.
 
-    Raises
-    ------
-    SettingsError
-        In its place.
+    Raises `SettingsError`: in its place.
     """
     try:
         yield

@@ -25,17 +25,7 @@ CANCEL_SECONDS = 5.0
 
 
 class Calls:
-    """Calls services of one node.
-
-    Parameters
-    ----------
-    spinner : Spinner
-        Whose node asks.
-    node_name : str
-        Full name of the node that is asked.
-    find_timeout : float
-        Seconds to look for the node before it is taken for absent.
-    """
+    """Calls services of one node."""
 
     def __init__(self, spinner: Spinner, node_name: str, find_timeout: float) -> None:
         self.spinner, self.node_name, self.find_timeout = spinner, node_name, find_timeout
@@ -43,12 +33,8 @@ class Calls:
     def call(self, client: Any, request: Any, timeout: float) -> Any:
         """Call a service and return the response, which is no error.
 
-        Raises
-        ------
-        SegmentationError
-            The node answered an error.
-        NodeUnavailableError
-            There is no such service, or no answer in time.
+        Raises `SegmentationError`: the node answered an error; `NodeUnavailableError`: there is no such service, or no
+        answer in time.
         """
         deadline = time.monotonic() + timeout
         self.find(client.service_is_ready, f"service {client.srv_name}", timeout)
@@ -100,10 +86,7 @@ class Calls:
     def settle(self, settled: Callable[[], object], ready: Callable[[], bool], what: str, deadline: float) -> None:
         """Wait for the effect of a request, for as long as the node is there.
 
-        Raises
-        ------
-        NodeUnavailableError
-            The node has gone, or the time is over.
+        Raises `NodeUnavailableError`: the node has gone, or the time is over.
         """
         in_time = self.spinner.wait_for(lambda: settled() or not ready(), deadline - time.monotonic())
         if not settled() and not self.spinner.wait_for(settled, GRACE_SECONDS if in_time else 0.0):

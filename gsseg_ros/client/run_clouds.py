@@ -20,15 +20,7 @@ _MOST = 16
 
 
 class RunClouds:
-    """Listens to a node's `~/cloud`; its methods may be called from several threads.
-
-    Parameters
-    ----------
-    spinner : Spinner
-        Whose node listens.
-    topic : str
-        Full name of the topic.
-    """
+    """Listens to a node's `~/cloud`, whose full name is `topic`; its methods may be called from several threads."""
 
     def __init__(self, spinner: Spinner, topic: str) -> None:
         self._spinner, self._lock = spinner, threading.Lock()
@@ -52,12 +44,8 @@ class RunClouds:
     def of_run(self, report: SegmentationReport, deadline: float) -> PointCloud2 | None:
         """Wait for the cloud of a run; None if it was not published, or that of a later one has come instead.
 
-        A run that others replaced, or got ahead of, is answered all the same; its report has no stage "publish".
-
-        Raises
-        ------
-        NodeUnavailableError
-            Neither has come by the deadline (s, `time.monotonic`).
+        A run that others replaced, or got ahead of, is answered all the same; its report has no stage "publish". Raises
+        `NodeUnavailableError`: neither has come by the deadline (s, `time.monotonic`).
         """
         stamp = stamp_ns(report.header.stamp)
         if all(stage.name != "publish" for stage in report.stages) and time.monotonic() < deadline:

@@ -21,12 +21,25 @@ from gsseg_msgs.action import Learn
 from gsseg_msgs.srv import Pick, RenderView, Segment
 from rclpy.action import ActionClient
 
-from gsseg_ros.client.answers import picked_object, rendered_view, segment_result
 from gsseg_ros.client.calls import LearnGoal, class_names, refinement
-from gsseg_ros.client.results import LearnResult, PickedObject, RenderedView, SegmentResult, Viewpoint
+from gsseg_ros.client.results import (
+    LearnResult,
+    PickedObject,
+    RenderedView,
+    SegmentResult,
+    Viewpoint,
+    seconds_of,
+)
 from gsseg_ros.client.run_clouds import RunClouds
 from gsseg_ros.client.scene_requests import SceneRequests
-from gsseg_ros.conversions import arrays_from_cloud, mask_image, viewpoint_messages
+from gsseg_ros.conversions import (
+    arrays_from_cloud,
+    labels_from_image,
+    mask_image,
+    picture_from_image,
+    viewpoint_messages,
+)
+from gsseg_ros.object_messages import box_from_object
 from gsseg_ros.qos import FEEDBACK_DEPTH, reliable
 
 
@@ -170,7 +183,11 @@ class SegmentationClient(SceneRequests):
             cloud = None if publish else answer.cloud
             while cloud is None and (cloud := self._clouds.of_run(answer.report, deadline)) is None:
                 answer = self._call(Segment, request, deadline - time.monotonic())
-        return segment_result(answer, arrays_from_cloud(cloud))
+        points, rgb, labels, confidence = arrays_from_cloud(cloud)
+        asked = np.isin(labels, [summary.class_id for summary in answer.report.classes])
+        drawn = labels_from_image(answer.label_image, "label_image") if answer.label_image.width else None
+        boxes = {thing.id: box_from_object(thing) for thing in answer.objects}
+        return SegmentResult(points[asked], labels[asked], confidence[asked], rgb[asked], answer.report, drawn, boxes)
 
     def pick(
         self,
@@ -200,7 +217,10 @@ class SegmentationClient(SceneRequests):
             request.mask = mask_image(mask, info.header, 16)
         for name, pixels in (("inside", inside), ("outside", outside)):
             setattr(request, name, [Point(x=float(column), y=float(row)) for column, row in pixels])
-        return picked_object(self._call(Pick, request, timeout))
+        answer = self._call(Pick, request, timeout)
+        cloud, index = arrays_from_cloud(answer.cloud), np.array(answer.indices, np.int64)
+        box = box_from_object(answer.object) if len(index) else None
+        return PickedObject(index, cloud.points, cloud.confidence, box, seconds_of(answer.stages))
 
     def render_view(
         self,
@@ -222,4 +242,9 @@ class SegmentationClient(SceneRequests):
             **refinement(refine, filter),
         )
         answer = self._call(RenderView, request, timeout)
-        return rendered_view(answer)
+        return RenderedView(
+            labels_from_image(answer.label_image, "label_image"),
+            picture_from_image(answer.confidence_image, "confidence_image") if answer.confidence_image.width else None,
+            picture_from_image(answer.overlay_image, "overlay_image") if answer.overlay_image.width else None,
+            seconds_of(answer.stages),
+        )

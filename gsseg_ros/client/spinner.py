@@ -21,20 +21,9 @@ TURN_SECONDS = 0.1
 class Spinner:
     """Spins a node in a thread, and wakes the threads that wait after each turn.
 
-    Parameters
-    ----------
-    name : str
-        Of the node.
-    context : rclpy.context.Context, optional
-        Where the node lives; it is the caller's to shut down. By default in a context of its own, so that neither
-        `rclpy.init` nor the arguments of the program matter, and Ctrl-C stays a KeyboardInterrupt.
-    domain_id : int, optional
-        ROS domain of a context of its own; by default that of the environment.
-
-    Attributes
-    ----------
-    node : rclpy.node.Node
-        To make subscriptions and clients on. Their callbacks run in the thread, and must be short and not raise.
+    The node is in a context of its own, unless one is given, which is the caller's to shut down: so neither
+    `rclpy.init` nor the arguments of the program matter, and Ctrl-C stays a KeyboardInterrupt. Callbacks of what is
+    made on `node` run in the thread, and must be short and not raise.
     """
 
     def __init__(self, name: str, context: Context | None = None, domain_id: int | None = None) -> None:
@@ -59,10 +48,7 @@ class Spinner:
     def wait_for(self, condition: Callable[[], Any], timeout: float) -> bool:
         """Wait until a condition holds, which is checked in the caller's thread; return whether it does.
 
-        Raises
-        ------
-        RuntimeError
-            The spinner was closed, or its context shut down: nothing will change any more.
+        Raises `RuntimeError`: the spinner was closed, or its context shut down: nothing will change any more.
         """
         with self._turned:
             held = self._turned.wait_for(lambda: self._ended or condition(), timeout)

@@ -39,23 +39,8 @@ class RosSource:
     """Asks a node to segment whenever its diagnostics report new views or a new result of learning.
 
     A request has the node publish its clouds, for all who listen. They hold the class of a Gaussian and its confidence,
-    and no other probabilities.
-
-    Parameters
-    ----------
-    scene : GaussianScene
-        The scene that the node has, too.
-    node_name : str
-        Name of the node, with its namespace if it has one.
-    domain_id : int, optional
-        ROS domain, if not that of the environment.
-    find_timeout : float
-        Seconds to look for the node.
-
-    Raises
-    ------
-    NodeUnavailableError
-        There is no such node.
+    and no other probabilities. The node has the same scene; its name may have a namespace before it. Raises
+    `NodeUnavailableError`: there is no such node.
     """
 
     def __init__(
@@ -86,12 +71,7 @@ class RosSource:
     def wait(self, timeout: float) -> LiveUpdate | None:
         """Wait until the node has new class probabilities, and fetch them.
 
-        Raises
-        ------
-        StateMismatchError
-            The node has another scene.
-        NodeUnavailableError
-            It does not answer.
+        Raises `StateMismatchError`: the node has another scene; `NodeUnavailableError`: it does not answer.
         """
         if not self._spinner.wait_for(lambda: self._said != self._shown, timeout):
             return None

@@ -22,31 +22,9 @@ from gsseg_ros.node.pairing import Pairing
 class CameraImages:
     """Listens to a camera's `image`, or `image/compressed`, while its overlay has subscribers, and finds their poses.
 
-    Parameters
-    ----------
-    node : LifecycleNode
-        Listens.
-    outputs : Outputs
-        Knows who looks.
-    live : LiveOutputs
-        Gets the pictures.
-    camera : CameraStreams
-        Whose pictures; it hands over every camera_info and every pose.
-    group : CallbackGroup
-        Of the other inputs.
-    compressed : bool
-        Whether pictures are compressed.
-
-    Raises
-    ------
-    SettingsError
-        Its quality of service is overridden by something impossible.
-
-    Attributes
-    ----------
-    pairing : Pairing
-        Pairs pictures as masks are paired, with poses of its own: those of masks are forgotten when their time is set
-        back, and these when that of the pictures is.
+    Pictures are paired as masks are, with poses of their own: those of masks are forgotten when the time of masks is
+    set back, and these when that of the pictures is. Raises `SettingsError`: the quality of service is overridden by
+    something impossible.
     """
 
     def __init__(

@@ -16,8 +16,7 @@ from gsseg_ros.conversions import matrix_from_pose, stamp_ns
 from gsseg_ros.node.masks.detections import Detected
 from gsseg_ros.node.pairing import Pairing, PairingSettings
 from gsseg_ros.node.parameters import Settings
-from gsseg_ros.node.pose_frames import PoseFrames
-from gsseg_ros.node.pose_sources import GivenPose, InterpolatedPoses, MessagePoses, PoseSource, TfFirst
+from gsseg_ros.node.pose_sources import GivenPose, InterpolatedPoses, MessagePoses, PoseFrames, PoseSource, TfFirst
 from gsseg_ros.node.tf_poses import TfPoses
 
 
@@ -38,29 +37,9 @@ def mask_class(settings: Settings) -> Any:
 class CameraStreams:
     """Subscribes to the topics of one camera, and pairs what comes. Messages are only put aside.
 
-    Parameters
-    ----------
-    name : str
-        What its topics begin with, as "front" for `front/mask`; "" for the only camera.
-    settings : Settings
-        Of the node.
-    tf : TfPoses or None
-        If TF can be used.
-    prefix : str
-        What the names of all its views begin with.
-    listen : Listen
-        Subscribes.
-    refuse_pose : callable
-        Gets what is wrong with a pose.
-    era : callable
-        The workspace's.
-
-    Attributes
-    ----------
-    pairing : Pairing
-        Of its masks.
-    accepted : int
-        Views that were fused.
+    Names of topics begin with its own, as "front" for `front/mask`; that of the only camera is empty. `prefix` is what
+    the names of all its views begin with; `era` tells the workspace's, and `refuse_pose` is told what is wrong with a
+    pose.
     """
 
     def __init__(
@@ -74,7 +53,7 @@ class CameraStreams:
         refuse_pose: Callable[[str], None],
         era: Callable[[], object],
     ) -> None:
-        self.name, self.accepted = name, 0
+        self.name, self.accepted = name, 0  # views that were fused
         self._settings, self._tf, self._refuse_pose, self._era = settings, tf, refuse_pose, era
         source = settings.pose_source
         in_base = settings.camera_in_base if source == "odometry" else None

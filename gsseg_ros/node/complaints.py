@@ -42,13 +42,6 @@ class Complaints:
 
     Its methods may be called from any thread. A kind that is not in `KINDS` counts as `OTHER`, so that there are never
     more of them, whatever a message says.
-
-    Parameters
-    ----------
-    warn : callable
-        Writes one line to the log.
-    now : callable
-        Seconds of a clock that never goes back.
     """
 
     def __init__(self, warn: Callable[[str], object], now: Callable[[], float] = time.monotonic) -> None:

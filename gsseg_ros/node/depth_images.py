@@ -10,10 +10,9 @@ from gsseg_core.data.view import View
 from gsseg_core.errors import GssegError, MaskFormatError
 from gsseg_core.live.session import LiveSession
 from gsseg_core.raster.depth_gating import Gated, gate_view
-from gsseg_ros.conversions import picture_from_image, require_encoding
+from gsseg_ros.conversions import picture_from_image, require_encoding, require_size
 from gsseg_ros.errors import DepthImageError
 from gsseg_ros.node.parameters import Settings
-from gsseg_ros.node.size_limits import require_size
 
 _METRES = {"16UC1": 1e-3, "32FC1": 1.0}
 """Of one unit of each encoding (REP 118)."""
@@ -24,24 +23,9 @@ def gate_by_image(
 ) -> Gated:
     """Make those pixels of a view's mask unknown in which a depth image contradicts the scene.
 
-    Parameters
-    ----------
-    session : LiveSession
-        Of the scene.
-    view : View
-        With the mask, undistorted where its lens is distorted.
-    message : Image
-        Depth of the same image as the mask's, of the same size or another of the same proportions; of a raw image, it
-        is undistorted as the mask was.
-    topic, frame_id : str
-        Of the depth image; of the mask.
-    settings : Settings
-        The node's.
-
-    Raises
-    ------
-    DepthImageError
-        It is of another frame, encoding or shape, or broken.
+    The depth image (of `topic`) is of the same image as the mask (of `frame_id`), of its size or of another of the same
+    proportions; of a raw image, it is undistorted as the mask was. Raises `DepthImageError`: it is of another frame,
+    encoding or shape, or broken.
     """
     try:
         require_size(message, settings.max_pixels, topic)
@@ -62,10 +46,7 @@ def gate_by_image(
 def depth_from_image(message: Image, topic: str) -> npt.NDArray[np.float32]:
     """Read a depth image (H, W) in metres, sent as 16UC1 in millimetres or as 32FC1; 0 or NaN where there is none.
 
-    Raises
-    ------
-    MaskFormatError
-        Another encoding, a size of zero, or data too short.
+    Raises `MaskFormatError`: another encoding, a size of zero, or data too short.
     """
     require_encoding(message, topic, _METRES, "depth as ")
     depth: npt.NDArray[np.float32] = picture_from_image(message, topic).astype(np.float32)

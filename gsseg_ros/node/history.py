@@ -13,24 +13,13 @@ T = TypeVar("T")
 class History(Generic[K, T]):
     """Values by stamp, or by stamp and frame, those of the newest stamps.
 
-    Parameters
-    ----------
-    capacity : int
-        Values that are kept, or what their sizes may add up to; the newest one is kept whatever its size.
-    size : callable
-        Size of a value; 1 unless given.
-
-    Attributes
-    ----------
-    stamps : list of int, or of (int, str)
-        Ascending.
-    values : dict
-        By stamp.
+    As many are kept as their sizes, 1 each unless `size` says otherwise, add up to the capacity; the newest one
+    whatever its size.
     """
 
     def __init__(self, capacity: int, size: Callable[[T], int] = lambda value: 1) -> None:
         self._capacity, self._size, self._total = capacity, size, 0
-        self.stamps: list[K] = []
+        self.stamps: list[K] = []  # ascending
         self.values: dict[K, T] = {}
 
     def add(self, stamp: K, value: T) -> None:

@@ -29,7 +29,7 @@ from gsseg_ros.node.jobs import Worker
 from gsseg_ros.node.live_outputs import LiveOutputs
 from gsseg_ros.node.masks.compressed import compressed_topic
 from gsseg_ros.node.masks.detections_input import DetectionsInput
-from gsseg_ros.node.masks.label_info_input import LabelInfoInput
+from gsseg_ros.node.masks.label_info import LabelInfoInput
 from gsseg_ros.node.masks.reader import MaskReader
 from gsseg_ros.node.matched_subscription import MatchedSubscription
 from gsseg_ros.node.outputs import Outputs
@@ -47,48 +47,26 @@ AWAITED_SECONDS, _PAUSE = 5.0, 0.02
 
 
 class Inputs:
-    """Subscribes from activation to deactivation. Callbacks only put messages aside; a worker fuses them.
-
-    Attributes
-    ----------
-    cameras : dict of str to CameraStreams
-        Those of the parameter cameras, by name; "" if there is only one.
-    arrivals : dict of str to (int, float)
-        By full name of the topic: messages so far, and when the last one came (s, `time.monotonic`).
-    roles : dict of str to str
-        By full name of the topic: what it is, such as "mask"; of those only that have to be there.
-    accepted : int
-        Views that were fused.
-    rejected : Counter of str
-        Masks that were not, by reason; "scene_changed" are those that came before the scene was loaded, reset or
-        replaced by a saved state, and had not been fused by then.
-    explained : dict of str to str
-        By reason: what was wrong with the last of these.
-    counted : deque of (float, Counter)
-        What `gsseg_ros.node.diagnostics` counted lately, and when (s, `time.monotonic`).
-    logged : Counter of str
-        How many of these it has named in the log.
-    gated : Counter of str
-        "views" that were held against depth images, and their pixels: "measured", and "contradicted" by what was.
-    refused_poses : int
-        Poses that could not be used.
-    last_refusal : (float, str)
-        When the last of these came (s, `time.monotonic`), and what was wrong with it.
-    """
+    """Subscribes from activation to deactivation. Callbacks only put messages aside; a worker fuses them."""
 
     def __init__(self, node: LifecycleNode, workspace: Workspace, outputs: Outputs, complaints: Complaints) -> None:
         self._node, self._workspace, self._complaints = node, workspace, complaints
-        self.accepted = 0
+        self.accepted = 0  # views that were fused
+        # Masks that were not, by reason; "scene_changed" are those that came before the scene was loaded, reset or
+        # replaced by a saved state, and had not been fused by then.
         self.rejected: Counter[str] = Counter()
-        self.explained: dict[str, str] = {}
+        self.explained: dict[str, str] = {}  # by reason: what was wrong with the last of these
         self._counting, self._handing = threading.Lock(), threading.Lock()
+        # "views" that were held against depth images, and their pixels: "measured", and "contradicted" by what was.
         self.gated: Counter[str] = Counter()
         self.refused_poses = 0
-        self.last_refusal = (-PERIOD, "")
+        self.last_refusal = (-PERIOD, "")  # when (s, `time.monotonic`), and what was wrong
+        # By full name of the topic: messages so far, and when the last one came (s, `time.monotonic`).
         self.arrivals: dict[str, tuple[int, float]] = {}
-        self.roles: dict[str, str] = {}
+        self.roles: dict[str, str] = {}  # by full name of the topic: what it is; of those only that have to be there
         self._subscriptions: list[MatchedSubscription] = []
         self.started = time.monotonic()
+        # For `gsseg_ros.node.diagnostics`: what it counted lately, and when (s); how many of these it has logged.
         self.counted: deque[tuple[float, Counter[str]]] = deque([(self.started, Counter())])
         self.logged: Counter[str] = Counter()
         self._told: Counter[str] = Counter()
@@ -116,7 +94,7 @@ class Inputs:
         self._masks = MaskReader(settings, workspace.label_space, self._say_once)
         self.label_info = LabelInfoInput(node, workspace.label_space, self._group, self._complaints)
         built.callback(self.label_info.close)
-        self.cameras: dict[str, CameraStreams] = {}
+        self.cameras: dict[str, CameraStreams] = {}  # by name; "" if there is only one
         self.detections: list[DetectionsInput] = []
         self._images: list[CameraImages] = []
         # A simulator's stamps repeat, and views of an earlier activation may come back with a saved state.

@@ -28,13 +28,7 @@ class Job:
         self._canceled.set()
 
     def check(self) -> None:
-        """Stop here if that was asked.
-
-        Raises
-        ------
-        CanceledError
-            It was.
-        """
+        """Stop here if that was asked. Raises `CanceledError`: it was."""
         if self._canceled.is_set():
             raise CanceledError(f"{self.name} was canceled; what was known before is kept")
 
@@ -48,13 +42,7 @@ class JobSlot:
 
     @contextmanager
     def take(self, name: str) -> Iterator[Job]:
-        """Run a job in the body.
-
-        Raises
-        ------
-        BusyError
-            Another one is running.
-        """
+        """Run a job in the body. Raises `BusyError`: another one is running."""
         with self._changed:
             if self._job is not None:
                 raise BusyError(f"{self._job.name} is running; expected to start {name} after it: cancel it, or wait")
@@ -105,13 +93,7 @@ class Requests:
 
 
 class Turns:
-    """Lets some requests work at a time and a few more wait for their turn.
-
-    Parameters
-    ----------
-    at_work, waiting : int
-        Number of each; one thread is held by each of them.
-    """
+    """Lets so many requests be at work at a time, and so many more wait for their turn; each holds a thread."""
 
     def __init__(self, at_work: int, waiting: int) -> None:
         self._places, self._turns = threading.Semaphore(at_work + waiting), threading.Semaphore(at_work)
@@ -120,10 +102,7 @@ class Turns:
     def take(self, name: str) -> Iterator[None]:
         """Wait for a turn, and work in the body.
 
-        Raises
-        ------
-        BusyError
-            As many as may already wait; this is found at once.
+        Raises `BusyError`: as many as may already wait; this is found at once.
         """
         if not self._places.acquire(blocking=False):
             raise BusyError(f"{name}: too many requests are at work or wait already; expected to be asked again later")
@@ -142,27 +121,14 @@ class Turns:
 class Worker(Generic[T]):
     """Handles items one after the other, in a thread of its own; of too many that wait, the oldest are dropped.
 
-    Parameters
-    ----------
-    handle : callable
-        Takes one item; must not raise.
-    capacity : int
-        Items that may wait.
-    size : callable
-        Bytes of an item.
-    most_bytes : int
-        What those that wait may have together; one may wait whatever its size.
-
-    Attributes
-    ----------
-    dropped : int
-        Items that were dropped.
+    `handle` must not raise. Of those that wait there are `capacity` at most, with `most_bytes` by `size` together; one
+    may wait whatever its size.
     """
 
     def __init__(
         self, handle: Callable[[T], None], capacity: int, size: Callable[[T], int] = lambda item: 0, most_bytes: int = 0
     ) -> None:
-        self.dropped = 0
+        self.dropped = 0  # items
         self._handle, self._capacity, self._size, self._most_bytes = handle, capacity, size, most_bytes
         self._items: deque[T] = deque()
         self._in_hand: list[T] = []

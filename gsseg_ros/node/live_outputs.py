@@ -24,14 +24,12 @@ from gsseg_core.raster.backends import make_operator
 from gsseg_core.scene.camera import Camera
 from gsseg_core.segmentation import Segmentation
 from gsseg_ros.camera_infos import camera_of_image, is_rectified
-from gsseg_ros.color_images import color_from_image
-from gsseg_ros.conversions import rgb_image
+from gsseg_ros.conversions import color_from_image, require_size, rgb_image
 from gsseg_ros.node.jobs import END_SECONDS
 from gsseg_ros.node.masks.compressed import decompress_picture
 from gsseg_ros.node.outputs import Outputs
 from gsseg_ros.node.pairing import Paired
 from gsseg_ros.node.reports import Selection
-from gsseg_ros.node.size_limits import require_size
 from gsseg_ros.node.workspace import Workspace
 
 CODES_PERIOD, OBJECTS_PERIOD = 1.0, 2.0
@@ -49,18 +47,8 @@ _PAUSE = 0.05  # s, between two looks at whether masks still wait
 class LiveOutputs:
     """Draws overlays and boxes objects in a thread, from activation to deactivation. Its methods return at once.
 
-    Parameters
-    ----------
-    workspace : Workspace
-        What is shown.
-    outputs : Outputs
-        Where.
-    busy : callable
-        Whether masks wait to be fused.
-    now : callable
-        The stamp of this moment.
-    complain : callable
-        Gets what is wrong with a camera image.
+    `busy` says whether masks wait to be fused, `now` gives the stamp of this moment, `complain` is told what is wrong
+    with a camera image.
     """
 
     def __init__(

@@ -30,38 +30,15 @@ class MatchedSubscription:
 
     What a best-effort stream loses is lost for good, and of large images that may be half; but a reliable subscription
     hears no best-effort publisher. So it is made anew when the publishers have changed. Where the parameter
-    qos_overrides says how reliable it is to be, it stays so.
-
-    Parameters
-    ----------
-    node : Node
-        Listens.
-    kind : type
-        Of the messages.
-    topic : str
-        Its name, not yet resolved.
-    callback : callable
-        Gets the messages.
-    group : CallbackGroup
-        Of the other inputs.
-
-    Raises
-    ------
-    SettingsError
-        Its quality of service is overridden by something impossible.
-
-    Attributes
-    ----------
-    topic_name : str
-        Full name of the topic.
-    lost : int
-        Messages that did not arrive, as far as the middleware knows.
+    qos_overrides says how reliable it is to be, it stays so. Raises `SettingsError`: its quality of service is
+    overridden by something impossible.
     """
 
     def __init__(
         self, node: Node, kind: Any, topic: str, callback: Callable[[Any], None], group: CallbackGroup
     ) -> None:
-        self.topic_name, self.lost = node.resolve_topic_name(topic), 0
+        self.topic_name = node.resolve_topic_name(topic)
+        self.lost = 0  # messages that did not arrive, as far as the middleware knows
         self._node, self._kind, self._topic, self._callback, self._group = node, kind, topic, callback, group
         self._matches = False  # Whether nobody has said how reliable it is to be.
         self._lock, self._closed = threading.Lock(), False

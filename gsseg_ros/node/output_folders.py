@@ -24,14 +24,8 @@ def pinned_folder(folder: Path, within: Path) -> Iterator[Path]:
 
     The folder is made where it is missing, below `within` or that itself; both are without links. Where the body raises
     an error, folders that were made and are empty go again, and in errors of gsseg the first name stands in the place
-    of the second.
-
-    Raises
-    ------
-    PathNotAllowedError
-        The folder is not below `within`.
-    WriteError
-        It cannot be made, or a part of its path is a file, or has become a link.
+    of the second. Raises `PathNotAllowedError`: the folder is not below `within`; `WriteError`: it cannot be made, or a
+    part of its path is a file, or has become a link.
     """
     if folder != within and within not in folder.parents:
         raise PathNotAllowedError(f"{folder}: does not lie below {within}; expected a path below it")
@@ -64,10 +58,7 @@ def _remove_where_failed(name: str, parent: int, error: type[BaseException] | No
 def require_own_folder(out: Path, kind: str) -> None:
     """Refuse a folder that holds anything but holds no results of this kind.
 
-    Raises
-    ------
-    PathTakenError, WriteError
-        It is such a folder, or cannot be looked into.
+    Raises `PathTakenError`, `WriteError`: it is such a folder, or cannot be looked into.
     """
     if os.path.lexists(out) and not os.path.isdir(out):
         raise PathTakenError(f"{out}: is not a folder; expected one, or nothing")
@@ -91,10 +82,8 @@ def require_own_folder(out: Path, kind: str) -> None:
 def staged_export(folder: Path, within: Path) -> Iterator[StagedRun]:
     """Give a run whose files become the export in a folder below `within`, which must hold nothing but exports.
 
-    Raises
-    ------
-    PathNotAllowedError, PathTakenError, WriteError
-        As `pinned_folder`, `require_own_folder` and `gsseg_core.files.run_folder.staged_run` do.
+    Raises `PathNotAllowedError`, `PathTakenError`, `WriteError`: as `pinned_folder`, `require_own_folder` and
+    `gsseg_core.files.run_folder.staged_run` do.
     """
     with pinned_folder(folder, within) as pinned:
         require_own_folder(pinned, "segment")

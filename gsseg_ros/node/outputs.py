@@ -38,29 +38,16 @@ class Outputs:
     """Publishes clouds, objects, report and overlay. Its methods may be called from any thread.
 
     A cloud that is latched always belongs to the last run, of all classes. A class has a topic while it has Gaussians
-    in the last run; the names that were announced have theirs all the time. Once closed, nothing is published.
-
-    Parameters
-    ----------
-    node : LifecycleNode
-        Publishes.
-    cameras : sequence of str
-        Those that have an overlay of their own, `~/overlay/<camera>`.
-
-    Attributes
-    ----------
-    objects_count : int
-        How often objects were published.
-    latched : Segment.Request or None
-        What the run was asked for whose clouds are latched; None if there are none.
+    in the last run; the names that were announced have theirs all the time. `cameras` have overlays of their own,
+    `~/overlay/<camera>`. Once closed, nothing is published.
     """
 
     def __init__(self, node: LifecycleNode, cameras: Sequence[str] = ()) -> None:
         self._node = node
         self._lock = threading.RLock()
         self._revision, self._closed = 0, False
-        self.objects_count = 0
-        self.latched: Segment.Request | None = None
+        self.objects_count = 0  # how often objects were published
+        self.latched: Segment.Request | None = None  # what the run was asked for whose clouds are latched, if any are
         self._always: list[Publisher] = []
         self._classes: dict[str, Publisher] = {}
         self._announced: set[str] = set()

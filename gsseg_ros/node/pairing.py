@@ -78,41 +78,20 @@ class Pairing:
 
     What is late and what shows that time was set back is said in `gsseg_ros.node.timeline.Timeline`.
 
-    Parameters
-    ----------
-    poses : PoseSource
-        One of `gsseg_ros.node.pose_sources`, or `gsseg_ros.node.tf_poses.TfPoses`.
-    settings : PairingSettings
-        Limits on the masks that wait.
-    prefix : str
-        What the names of all pairs begin with: epochs and stamps of another pairing may be the same.
-    stream : str
-        What comes out with every pair: which camera's it is.
-
-    Attributes
-    ----------
-    dropped : Counter
-        Masks not paired, by reason: "no_pose", "bad_pose" (it came and was refused), "no_camera_info", "no_depth",
-        "repeated_stamp" (and the same frame_id), "several_cameras" (whose poses cannot be told apart),
-        "negative_stamp", and "time_jump" for one from before time was set back that came after it.
-    out_of_order : int
-        Masks that were older than one before them; they are paired all the same.
-    time_jumps : int
-        How often time was set back by a second or more: a bag loops, a simulator starts again. All that was kept is
-        dropped then, and the same stamps are new ones.
-    unmatched_frame : str
-        The frame_id of the last mask that was dropped for want of a camera_info.
-    negative_stamp : int
-        That of the last mask that was dropped for it, ns.
+    Names of pairs begin with `prefix`, for epochs and stamps of another pairing may be the same; with every pair comes
+    `stream`, which says of which camera it is.
     """
 
     def __init__(
         self, poses: PoseSource, settings: PairingSettings | None = None, prefix: str = "", stream: str = ""
     ) -> None:
+        # Masks not paired, by reason: "no_pose", "bad_pose" (it came and was refused), "no_camera_info", "no_depth",
+        # "repeated_stamp" (and the same frame_id), "several_cameras" (whose poses cannot be told apart),
+        # "negative_stamp", and "time_jump" for one from before time was set back that came after it.
         self.dropped: Counter[str] = Counter()
-        self.out_of_order = 0
-        self.unmatched_frame = ""
-        self.negative_stamp = 0
+        self.out_of_order = 0  # masks that were older than one before them; they are paired all the same
+        self.unmatched_frame = ""  # frame_id of the last mask that was dropped for want of a camera_info
+        self.negative_stamp = 0  # that of the last mask that was dropped for it, ns
         self._poses = poses
         self._prefix, self._stream = prefix, stream
         self._settings = settings or PairingSettings()
@@ -162,12 +141,8 @@ class Pairing:
     def expire(self, now_s: float) -> None:
         """Pair or drop the masks that have waited long enough; call it some ten times a second.
 
-        A mask's time runs from the first call that finds it waiting.
-
-        Parameters
-        ----------
-        now_s : float
-            Seconds of a clock that never goes back, such as `time.monotonic`.
+        A mask's time runs from the first call that finds it waiting, by a clock that never goes back, such as
+        `time.monotonic`.
         """
         with self._lock:
             self._awake_s += min(max(now_s - self._called_s, 0.0), _LONGEST_STEP_S)
@@ -214,7 +189,10 @@ class Pairing:
 
     @property
     def time_jumps(self) -> int:
-        """How often time was set back."""
+        """How often time was set back by a second or more: a bag loops, a simulator starts again.
+
+        All that was kept is dropped then, and the same stamps are new ones.
+        """
         return self._timeline.epoch
 
     @property

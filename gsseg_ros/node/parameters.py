@@ -44,10 +44,7 @@ _CAMERA = re.compile(r"[A-Za-z](_?[A-Za-z0-9])*")  # Such that it may be part of
 class Settings:
     """The parameters as the node uses them; see `gsseg_ros.node.declarations`.
 
-    Raises
-    ------
-    SettingsError
-        A value is impossible; the message names the parameter.
+    Raises `SettingsError`: a value is impossible; the message names the parameter.
     """
 
     scene_path: str

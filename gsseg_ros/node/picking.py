@@ -19,12 +19,11 @@ from gsseg_core.objects.oriented_boxes import class_box
 from gsseg_core.scene.camera import Camera
 from gsseg_core.scene.gaussian_scene import GaussianScene
 from gsseg_ros.camera_infos import camera_of_image, image_size
-from gsseg_ros.conversions import byte_array, cloud
+from gsseg_ros.conversions import byte_array, cloud, require_size
 from gsseg_ros.errors import InvalidRequestError, TooManyPixelsError, ViewpointError
 from gsseg_ros.frames import Similarity
 from gsseg_ros.node.masks.reader import read_image
 from gsseg_ros.node.parameters import Settings
-from gsseg_ros.node.size_limits import require_size
 from gsseg_ros.node.viewpoints import Lookup, viewpoint_pose
 from gsseg_ros.object_messages import color_message, object_message
 
@@ -43,14 +42,9 @@ def pick_object(
 ) -> Pick:
     """Pick the object of a scene that a request shows; `rectified` says what its mask and its points are of.
 
-    Raises
-    ------
-    InvalidRequestError
-        The mask or the points cannot be used, or there are both or neither.
-    ViewpointError, NoTransformError
-        The view cannot be used.
-    NoUsableViewsError
-        The view does not show both the object and what is not it.
+    Raises `InvalidRequestError`: the mask or the points cannot be used, or there are both or neither; `ViewpointError`,
+    `NoTransformError`: the view cannot be used; `NoUsableViewsError`: the view does not show both the object and what
+    is not it.
     """
     from gsseg_core.objects.pick import pick_clicks, pick_mask  # A node starts without the SciPy that it needs.
 

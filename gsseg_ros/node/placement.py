@@ -21,25 +21,14 @@ class Placement:
 
     Each view is moved by itself, in a thread, and others are fused in between. In the end votes are what they would be
     if every view that is kept had come when the scene was there already.
-
-    Parameters
-    ----------
-    loaded : callable
-        The session, if any, whose views follow: a `LivingSession`, or a `PerViewSession`, which loads SciPy.
-
-    Attributes
-    ----------
-    settled : callable
-        Called in that thread when all views have followed.
-    refused : callable
-        Gets what was wrong with a view that cannot follow; it stays where it is until the next change.
-    fusing : threading.RLock
-        Held from where a view's pose is brought into the scene until it is fused, and while the scene is moved.
     """
 
     def __init__(self, loaded: Callable[[], Any]) -> None:
-        self.fusing, self._loaded = threading.RLock(), loaded
-        self.settled: Callable[[], None] = lambda: None
+        # Held from where a view's pose is brought into the scene until it is fused, and while the scene is moved.
+        self.fusing = threading.RLock()
+        self._loaded = loaded  # the session, if any: a `LivingSession`, or a `PerViewSession`, which loads SciPy
+        self.settled: Callable[[], None] = lambda: None  # called in that thread when all views have followed
+        # Told what was wrong with a view that cannot follow; it stays where it is until the next change.
         self.refused: Callable[[str], None] = lambda message: None
         self._moved_from: _Ways = {}  # By view, to where it has to follow.
         self._left: dict[str, Similarity] = {}  # By view that could not follow: where the scene was for it.

@@ -1,4 +1,4 @@
-"""Poses of cameras at the stamps of their masks: of exactly that stamp, of those around it, or of TF first.
+"""Poses of cameras in the map at the stamps of their masks: of exactly that stamp, of those around it, or of TF first.
 
 Nothing here knows ROS; `gsseg_ros.node.tf_poses` has the poses that TF knows.
 """
@@ -30,14 +30,59 @@ class GivenPose:
     child_frame_id: str = ""  # frame whose pose it is; "" for one that is not named
 
 
-class Frames(Protocol):
-    """Knowledge of how frames lie to each other."""
+class Transforms(Protocol):
+    """What TF knows."""
 
-    def camera_in_map(self, given: GivenPose, stamp: int, frame_id: str) -> Pose | None:
-        """Pose (4, 4) in the map of the camera `frame_id`, of a pose at `stamp`; None if it is not known (yet)."""
+    def look_up(self, frame_id: str, stamp: int, within: str = "") -> Pose | None:
+        """Look up the pose (4, 4) of a frame in another, the map if none is named; None if not known (yet)."""
 
     def set_back(self, before: int, began: int) -> None:
         """Forget what is from before time was set back from `before` to `began` (ns)."""
+
+
+class PoseFrames:
+    """Composes a pose with what lies between its frame and the map, and between its child frame and the camera.
+
+    Without `transforms`, poses must be in the map; without `camera_in_base`, the camera's optical frame in the child
+    frame of every pose, poses of another frame than the camera's need them.
+    """
+
+    def __init__(
+        self, map_frame: str, transforms: Transforms | None = None, camera_in_base: Pose | None = None
+    ) -> None:
+        self._map_frame, self._transforms, self._camera_in_base = map_frame, transforms, camera_in_base
+
+    @property
+    def tells_apart(self) -> bool:
+        """Whether it knows where on the robot each camera is."""
+        return self._transforms is not None and self._camera_in_base is None
+
+    def reaches_map(self, frame_id: str) -> bool:
+        """Whether poses in a frame can be used, now or once TF knows it."""
+        return frame_id in ("", self._map_frame) or self._transforms is not None
+
+    def camera_in_map(self, given: GivenPose, stamp: int, frame_id: str) -> Pose | None:
+        """Pose (4, 4) in the map of the camera `frame_id`, of a pose at `stamp` (ns); None if it is not known (yet)."""
+        to_map = self._known(given.frame_id, "", stamp) if given.frame_id not in ("", self._map_frame) else np.eye(4)
+        camera = self._camera_in(given.child_frame_id, frame_id, stamp)
+        return None if to_map is None or camera is None else to_map @ given.matrix @ camera
+
+    def set_back(self, before: int, began: int) -> None:
+        """Forget the transforms from before time was set back from `before` to `began` (ns)."""
+        if self._transforms is not None:
+            self._transforms.set_back(before, began)
+
+    def _camera_in(self, child: str, frame_id: str, stamp: int) -> Pose | None:
+        if child and child == frame_id:  # The pose is the camera's own.
+            return np.eye(4)
+        if self._camera_in_base is not None:
+            return self._camera_in_base
+        # Without the two names nothing could be looked up: it is meant to be the camera's.
+        return self._known(frame_id, child, stamp) if child and frame_id else np.eye(4)
+
+    def _known(self, frame_id: str, within: str, stamp: int) -> Pose | None:
+        # To TF a stamp of zero means "the latest", which belongs to another image.
+        return self._transforms.look_up(frame_id, stamp, within) if self._transforms is not None and stamp > 0 else None
 
 
 class PoseSource(Protocol):
@@ -67,16 +112,11 @@ class PoseSource(Protocol):
 class MessagePoses:
     """Poses from messages: that of exactly a mask's stamp, or those close enough to it.
 
-    Parameters
-    ----------
-    tolerance_s : float
-        Seconds that a pose may lie before or after the mask. Between one before and one after, it is interpolated;
-        where only one of them is as close, that one is taken.
-    frames : Frames, optional
-        Takes poses to the map and to the camera; without, they are those of cameras in the map.
+    A pose may lie so many seconds before or after the mask. Between one before and one after, it is interpolated; where
+    only one of them is as close, that one is taken. Without `frames`, poses are those of cameras in the map.
     """
 
-    def __init__(self, tolerance_s: float = 0.0, frames: Frames | None = None) -> None:
+    def __init__(self, tolerance_s: float = 0.0, frames: PoseFrames | None = None) -> None:
         self._poses: History[int, GivenPose] = History(_POSES_KEPT)
         self._refused: History[int, None] = History(_POSES_KEPT)
         self._tolerance_ns, self._frames = round(tolerance_s * SECOND), frames
@@ -141,17 +181,10 @@ class MessagePoses:
 class InterpolatedPoses(MessagePoses):
     """Poses of an odometry, which runs at its own rate: between the two that bracket a mask's stamp.
 
-    Parameters
-    ----------
-    max_gap_s : float
-        The two may be so many seconds apart.
-    frames : Frames, optional
-        As for `MessagePoses`.
-    tells_apart : bool
-        Whether `frames` knows where on the robot each camera is.
+    The two may be so many seconds apart. `tells_apart` says whether `frames` knows where on the robot each camera is.
     """
 
-    def __init__(self, max_gap_s: float = 0.2, frames: Frames | None = None, tells_apart: bool = False) -> None:
+    def __init__(self, max_gap_s: float = 0.2, frames: PoseFrames | None = None, tells_apart: bool = False) -> None:
         super().__init__(0.0, frames)
         self._max_gap_ns, self._tells_apart, self._bridges = round(max_gap_s * SECOND), tells_apart, True
 
@@ -170,17 +203,9 @@ class InterpolatedPoses(MessagePoses):
 
 
 class TfFirst(MessagePoses):
-    """Poses that TF knows, and else those of messages.
+    """Poses that TF knows at the mask's stamp, and else those of messages."""
 
-    Parameters
-    ----------
-    tf : PoseSource
-        Asked first, at the mask's stamp.
-    tolerance_s, frames
-        As for `MessagePoses`.
-    """
-
-    def __init__(self, tf: PoseSource, tolerance_s: float = 0.0, frames: Frames | None = None) -> None:
+    def __init__(self, tf: PoseSource, tolerance_s: float = 0.0, frames: PoseFrames | None = None) -> None:
         super().__init__(tolerance_s, frames)
         self._tf = tf
 

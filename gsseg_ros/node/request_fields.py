@@ -21,10 +21,7 @@ PAPER, CARVE = "paper", "carve"
 def chosen_classes(request: Any, class_names: Mapping[int, str]) -> list[int]:
     """Ids of the classes that a request asks for, ascending; all if it names none.
 
-    Raises
-    ------
-    UnknownClassError
-        A name or number does not exist, or several classes have the name.
+    Raises `UnknownClassError`: a name or number does not exist, or several classes have the name.
     """
     try:
         return sorted(class_ids(request.classes, class_names) or class_names)
@@ -33,13 +30,7 @@ def chosen_classes(request: Any, class_names: Mapping[int, str]) -> list[int]:
 
 
 def checked_confidence(request: Any) -> float:
-    """Threshold of a request.
-
-    Raises
-    ------
-    InvalidRequestError
-        It is not in [0, 1].
-    """
+    """Threshold of a request. Raises `InvalidRequestError`: it is not in [0, 1]."""
     if not 0 <= request.min_confidence <= 1:
         raise InvalidRequestError(f"min_confidence is {request.min_confidence}; expected 0 to 1")
     return float(request.min_confidence)
@@ -48,10 +39,7 @@ def checked_confidence(request: Any) -> float:
 def level_of(request: Any, settings: Settings) -> float:
     """Level of parts and wholes that a request asks for, as the parameter granularity has it.
 
-    Raises
-    ------
-    InvalidRequestError
-        It is above 1 or no number, or there are no parts.
+    Raises `InvalidRequestError`: it is above 1 or no number, or there are no parts.
     """
     if not isinstance(request, Segment.Request) or not len(request.granularity):
         return settings.granularity
@@ -70,12 +58,7 @@ def refinement(request: Any, settings: Settings) -> RefineSettings:
     """Refinement as a request asks for it, with the node's k and beta.
 
     Files are made to be kept, and worth the seconds that carving takes; what is asked for while the robot moves is not,
-    unless the request says so.
-
-    Raises
-    ------
-    InvalidRequestError
-        There is no such refinement.
+    unless the request says so. Raises `InvalidRequestError`: there is no such refinement.
     """
     default = CARVE if isinstance(request, Export.Request) else PAPER
     if request.refine not in ("", PAPER, CARVE):

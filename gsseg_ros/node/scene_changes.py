@@ -31,17 +31,9 @@ _Key: TypeAlias = tuple[str, ...]
 class SceneChanges:
     """Creates the services and the subscription, and answers them.
 
-    What is wrong with a message of the topic goes to the log and to /diagnostics, and changes nothing. A learn job need
-    not be canceled: what it learns is carried over to the scene as it is then.
-
-    Parameters
-    ----------
-    services : Services
-        Those of the node: requests here take turns with theirs.
-    complain : callable
-        Told in one line what is wrong with a message of the topic.
-    await_fused : callable
-        Waits until masks of some stamps that have come are fused: a change may name keyframes that are just under way.
+    What is wrong with a message of the topic goes to the log, by `complain`, and to /diagnostics, and changes nothing.
+    A learn job need not be canceled: what it learns is carried over to the scene as it is then. `await_fused` waits
+    until masks of some stamps that have come are fused: a change may name keyframes that are just under way.
     """
 
     def __init__(

@@ -23,10 +23,7 @@ from gsseg_ros.qos import latched
 def placed(request: LoadScene.Request) -> list[Parameter]:
     """Read where a request puts the scene, as parameters; none if it says nothing of that.
 
-    Raises
-    ------
-    InvalidRequestError
-        Scale or pose are impossible.
+    Raises `InvalidRequestError`: scale or pose are impossible.
     """
     scale, pose = request.scene_to_map_scale, request.scene_to_map
     if scale == 0:
@@ -49,10 +46,7 @@ def placed(request: LoadScene.Request) -> list[Parameter]:
 def placed_by(node: Any, wanted: Sequence[Parameter]) -> Iterator[None]:
     """Set where the scene lies, as `placed` reads it; and as it was if something is raised in the body.
 
-    Raises
-    ------
-    InvalidRequestError
-        It was refused.
+    Raises `InvalidRequestError`: it was refused.
     """
     before = [node.get_parameter(parameter.name) for parameter in wanted]
     if wanted and not (result := node.set_parameters_atomically(wanted)).successful:
@@ -69,13 +63,7 @@ class SceneFrame:
     """Publishes `map_frame -> scene_frame` on `/tf_static`, as tf2_ros does; nothing where tf2_msgs is not installed.
 
     The scale is left out, as transforms have none: the axes of the frame are those of the scene, its unit is a metre.
-
-    Parameters
-    ----------
-    node : LifecycleNode
-        Publishes.
-    map_frame, scene_frame : str
-        Names of the frames; without the second, nothing is published.
+    Without a `scene_frame`, nothing is published.
     """
 
     def __init__(self, node: Any, map_frame: str, scene_frame: str) -> None:

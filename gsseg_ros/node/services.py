@@ -108,18 +108,9 @@ def _unforeseen(error: Exception) -> str:
 class Services:
     """Creates the services and answers their requests.
 
-    Parameters
-    ----------
-    node : LifecycleNode
-        Offers the services.
-    workspace : Workspace
-        What they work on.
-    outputs : callable
-        The outputs, which exist while the node is configured.
-    lookup : callable
-        The transform lookup, which exists while the node is active with pose_source tf.
-    show : callable
-        Called after each change of the scene: objects are published as after a view, clouds wait for the next run.
+    The outputs exist while the node is configured, and what looks up transforms while it is active and has tf2_ros.
+    `show` is called after each change of what is known: objects are published as after a view, clouds wait for the next
+    run.
     """
 
     def __init__(

@@ -20,15 +20,7 @@ _BACK = JumpThreshold(min_forward=None, min_backward=Duration(seconds=-1), on_cl
 
 
 class SimTime:
-    """Watches the clock of a node that goes by /clock; ask it once a second.
-
-    Parameters
-    ----------
-    node : rclpy.node.Node
-        Its parameter use_sim_time says whether it does; else there is never a problem.
-    now : callable
-        Seconds of a clock that goes on whatever /clock does.
-    """
+    """Watches the clock of a node that goes by /clock, as its parameter use_sim_time says; ask it once a second."""
 
     def __init__(self, node: Any, now: Callable[[], float] = time.monotonic) -> None:
         self._node, self._now = node, now

@@ -20,29 +20,10 @@ _UNDER_WAY = 100  # Transforms from before time was set back that may come after
 class TfPoses:
     """Poses of the frames that masks are stamped with, looked up in TF at the mask's stamp, never the latest.
 
-    It listens from the first question on.
-
-    Parameters
-    ----------
-    node : rclpy.node.Node
-        Listens to `/tf` and `/tf_static`.
-    map_frame : str
-        Frame in which poses are wanted.
-
-    Attributes
-    ----------
-    knows_frames : bool
-        True: every camera has a pose of its own.
-    problem : str
-        Why the last lookup found nothing; empty if it found a pose.
-
-    Raises
-    ------
-    SettingsError
-        tf2_ros cannot be imported.
+    It listens from the first question on. Raises `SettingsError`: tf2_ros cannot be imported.
     """
 
-    knows_frames = True
+    knows_frames = True  # Every camera has a pose of its own.
 
     def __init__(self, node: Any, map_frame: str) -> None:
         try:
@@ -53,7 +34,7 @@ class TfPoses:
                 f"parameter pose_source is 'tf', but TF cannot be used here ({error}); expected the apt package "
                 "ros-jazzy-tf2-ros-py to be installed, or pose_source 'topic' or 'odometry'"
             ) from error
-        self.problem = ""
+        self.problem = ""  # why the last lookup found nothing; empty if it found a pose
         self._map_frame = map_frame
         self._buffer = Buffer()
         self._heard = _Heard(self._buffer)

@@ -41,25 +41,13 @@ class Timeline:
     bag. Once time was set back, a stream may still bring stragglers from before: they go on from where the stream was,
     and are a second or more ahead of all that came since.
 
-    Parameters
-    ----------
-    capacity : int
-        So many messages are held at most, and no more of one stream are taken for stragglers.
-
-    Attributes
-    ----------
-    epoch : int
-        How often time was set back so far.
-    last_jump : (int, int)
-        From where to where that was, the last time, ns.
-    lost_masks : int
-        Masks from before time was set back that came after it.
+    At most `capacity` messages are held, and no more of one stream are taken for stragglers.
     """
 
     def __init__(self, capacity: int) -> None:
-        self.epoch = 0
-        self.last_jump = (0, 0)
-        self.lost_masks = 0
+        self.epoch = 0  # how often time was set back so far
+        self.last_jump = (0, 0)  # from where to where, the last time, ns
+        self.lost_masks = 0  # those from before time was set back that came after it
         self._capacity = capacity
         self._newest: dict[str, int] = {}  # Of each stream, in this time.
         self._before: dict[str, int] = {}  # Of the streams that have sent nothing in this time, in the one before.
@@ -119,12 +107,8 @@ class Timeline:
     def expire(self, now_s: float) -> list[Message]:
         """Judge what has been held long enough; call it some ten times a second.
 
-        Time runs from the first call that finds something held.
-
-        Parameters
-        ----------
-        now_s : float
-            Seconds of a clock that never goes back, such as `time.monotonic`.
+        Time runs from the first call that finds something held, by a clock that never goes back, such as
+        `time.monotonic`.
         """
         if not self._held:
             return []

@@ -17,11 +17,10 @@ from gsseg_core.export.view_pictures import background_image
 from gsseg_core.raster.backends import make_operator
 from gsseg_core.scene.camera import Camera
 from gsseg_ros.camera_infos import camera_from_messages
-from gsseg_ros.conversions import confidence_image, mask_image, matrix_from_pose, rgb_image, stamp_ns
+from gsseg_ros.conversions import confidence_image, mask_image, matrix_from_pose, require_size, rgb_image, stamp_ns
 from gsseg_ros.errors import NoTransformError, TooManyPixelsError, ViewpointError
 from gsseg_ros.node.parameters import Settings
 from gsseg_ros.node.reports import Selection
-from gsseg_ros.node.size_limits import require_size
 
 Lookup: TypeAlias = Callable[[str, int], "npt.NDArray[np.float64] | None"]
 """Pose (4, 4) of a frame in the map frame at a stamp in ns, 0 being the latest; None where there is none."""
@@ -39,12 +38,8 @@ class Drawing:
 def viewpoint(request: Any, settings: Settings, lookup: Lookup | None) -> Camera:
     """Make the scene's camera of the viewpoint of a request.
 
-    Raises
-    ------
-    ViewpointError
-        Pose or camera cannot be used, or it has more pixels than the parameter max_pixels allows.
-    NoTransformError
-        The pose is in a frame that is not the map and cannot be looked up.
+    Raises `ViewpointError`: pose or camera cannot be used, or it has more pixels than the parameter max_pixels allows;
+    `NoTransformError`: the pose is in a frame that is not the map and cannot be looked up.
     """
     info = request.viewpoint_camera
     try:
@@ -58,12 +53,7 @@ def viewpoint(request: Any, settings: Settings, lookup: Lookup | None) -> Camera
 def viewpoint_pose(request: Any, settings: Settings, lookup: Lookup | None) -> npt.NDArray[np.float64]:
     """Read the pose (4, 4) of the optical frame in the map, in metres, of the viewpoint of a request.
 
-    Raises
-    ------
-    PoseError
-        It is none.
-    NoTransformError
-        It is in a frame that is not the map and cannot be looked up.
+    Raises `PoseError`: it is none; `NoTransformError`: it is in a frame that is not the map and cannot be looked up.
     """
     pose = request.viewpoint_pose
     matrix, frame = matrix_from_pose(pose.pose, "viewpoint_pose"), pose.header.frame_id

@@ -51,46 +51,22 @@ class Run:
 
 
 class Workspace:
-    """Holds settings, session and job slot between requests. All its methods may be called from any thread.
-
-    Attributes
-    ----------
-    settings : Settings
-        As of now.
-    placement : Placement
-        Has views follow the scene.
-    slot : JobSlot
-        Taken by whatever must not run beside a learn job.
-    requests : Requests
-        Those at work.
-    forget_waiting : callable
-        Drops the masks that wait to be fused.
-    label_space : LabelSpace
-        What labels of masks mean.
-    active : bool
-        Whether the node's lifecycle state is active.
-    activations : set of str
-        Tokens of all its activations, with which the names of their views begin.
-    last_job : str
-        What the last job was, and how it ended.
-    dropped : Counter of str
-        Masks that never came to be views, by reason, since the scene was loaded or reset.
-    changes : Counter of str
-        Changes of the scene that were made and refused, and the views that they left, lifted anew, and did not find.
-    refused_change : (float, str)
-        When the last message of the topic scene_delta was refused (s, `time.monotonic`), and why.
-    """
+    """Holds settings, session and job slot between requests. All its methods may be called from any thread."""
 
     def __init__(self, settings: Settings, now: Callable[[], Time]) -> None:
-        self.settings, self.slot, self.requests = settings, JobSlot(), Requests()
+        self.settings, self.requests = settings, Requests()  # as of now; those at work
+        self.slot = JobSlot()  # taken by whatever must not run beside a learn job
         self.placement = Placement(lambda: self._session)
-        self.forget_waiting: Callable[[], None] = lambda: None
+        self.forget_waiting: Callable[[], None] = lambda: None  # drops the masks that wait to be fused
         self.label_space = LabelSpace(settings.class_names, None, settings.max_classes)
         self._at_start = {name: getattr(settings, name) for name in _PATHS}
+        # Whether the node's state is active; what names of views begin with, a token of each activation.
         self.active, self.activations = False, set[str]()
-        self.last_job = "none"
-        self.dropped: Counter[str] = Counter()
+        self.last_job = "none"  # and how it ended
+        self.dropped: Counter[str] = Counter()  # masks that never became views, by reason, since a load or a reset
+        # Changes of the scene made and refused, and the views that they left, lifted anew, and did not find.
         self.changes: Counter[str] = Counter()
+        # When the last message of the topic scene_delta was refused (s, `time.monotonic`), and why.
         self.refused_change = (float("-inf"), "")
         self._now = now
         self._session: LiveSession | None = None
@@ -104,13 +80,7 @@ class Workspace:
 
     @property
     def session(self) -> LiveSession:
-        """The session of the scene.
-
-        Raises
-        ------
-        NoSceneError
-            No scene is loaded.
-        """
+        """The session of the scene. Raises `NoSceneError`: no scene is loaded."""
         if (session := self._session) is None:
             raise NoSceneError("no scene is loaded; expected the parameter scene_path, or a call of ~/load_scene")
         return session
@@ -119,12 +89,8 @@ class Workspace:
     def living_session(self) -> LivingSession:
         """The session of the scene, for what changes it and for what other robots have learnt.
 
-        Raises
-        ------
-        NoSceneError
-            No scene is loaded.
-        InvalidRequestError
-            The session finds its objects itself, and so cannot follow.
+        Raises `NoSceneError`: no scene is loaded; `InvalidRequestError`: the session finds its objects itself, and so
+        cannot follow.
         """
         if not isinstance(session := self.session, LivingSession):
             raise InvalidRequestError(
@@ -142,10 +108,7 @@ class Workspace:
     def require_allowed(self, settings: Settings) -> None:
         """Refuse what a peer may not set the parameters scene_path and label_map to.
 
-        Raises
-        ------
-        PathNotAllowedError
-            It is not what was given at the start, and no request could name it.
+        Raises `PathNotAllowedError`: it is not what was given at the start, and no request could name it.
         """
         for name, at_start in self._at_start.items():
             path = getattr(settings, name)
@@ -158,14 +121,8 @@ class Workspace:
     def parameter_path(self, name: str) -> tuple[Path, Path | None]:
         """Path of the parameter scene_path or label_map, and the folder that it must not lead out of.
 
-        There is no such folder for what was given at the start.
-
-        Raises
-        ------
-        MissingFileError
-            There is no such file.
-        PathNotAllowedError
-            It was set later, and does not lie below data_root.
+        There is no such folder for what was given at the start. Raises `MissingFileError`: there is no such file;
+        `PathNotAllowedError`: it was set later, and does not lie below data_root.
         """
         path = Path(getattr(self.settings, name))
         self.require_allowed(self.settings)
@@ -174,13 +131,7 @@ class Workspace:
         return path, None if str(path) == self._at_start[name] else self.root
 
     def configure(self, settings: Settings) -> None:
-        """Take in the parameters, and read the label map.
-
-        Raises
-        ------
-        GssegError
-            The label map cannot be used.
-        """
+        """Take in the parameters, and read the label map. Raises `GssegError`: the label map cannot be used."""
         self.settings, new_names = settings, None
         if settings.label_map:
             path, within = self.parameter_path("label_map")
@@ -195,14 +146,8 @@ class Workspace:
     def load_scene(self, path: str | Path, within: Path | None, placed: AbstractContextManager[object]) -> None:
         """Load a scene in place of the one there is, with all that was known of that; on any error nothing changes.
 
-        Parameters
-        ----------
-        path : path
-            A scene of any format in `gsseg_core.scene.scene_formats`.
-        within : pathlib.Path or None
-            A folder that its links must not lead out of.
-        placed : context manager
-            Entered last, to put the scene where it is to lie; what it raises ends the work.
+        `within` is a folder that its links must not lead out of. `placed` is entered last, to put the scene where it is
+        to lie; what it raises ends the work.
         """
         settings = self.settings
         scene = GaussianScene.load(path, within)
@@ -309,13 +254,9 @@ class Workspace:
     def path(self, request: str, default: str = "") -> Path:
         """Resolve a path of a request, absolute or relative to data_root.
 
-        Between this and the opening any part of it may become a link to elsewhere: open it as
-        `open_input` and `pinned_folder` do.
-
-        Raises
-        ------
-        PathNotAllowedError
-            It is not below data_root once all links are followed, or data_root is not set.
+        Between this and the opening any part of it may become a link to elsewhere: open it as `open_input` and
+        `pinned_folder` do. Raises `PathNotAllowedError`: it is not below data_root once all links are followed, or
+        data_root is not set.
         """
         if not self.settings.data_root:
             raise PathNotAllowedError(
@@ -334,12 +275,7 @@ class Workspace:
     def existing(self, request: str, default: str = "") -> Path:
         """Resolve a path of a request as `path` does.
 
-        Raises
-        ------
-        PathNotAllowedError
-            As `path` does.
-        MissingFileError
-            There is no such file or folder.
+        Raises `PathNotAllowedError`: as `path` does; `MissingFileError`: there is no such file or folder.
         """
         path = self.path(request, default)
         if not os.path.exists(path):  # Path.exists raises an error where a name is too long.
@@ -351,10 +287,7 @@ class Workspace:
     def existing_in(self, folder: Path, request: str) -> Path | None:
         """Resolve a path of a request that lies in a folder, or else below data_root; None for none.
 
-        Raises
-        ------
-        PathNotAllowedError, MissingFileError
-            As `existing` does.
+        Raises `PathNotAllowedError`, `MissingFileError`: as `existing` does.
         """
         if not request:
             return None

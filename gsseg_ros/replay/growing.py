@@ -32,21 +32,11 @@ _PAUSE = 10.0  # masks that the node gets to fuse what came, before the loop clo
 class GrowingSource(FolderSource):
     """The views of a dataset folder, and between them the scene, submap by submap.
 
-    The node has the whole scene of the folder. The first message leaves of it the first submap; the others arrive one
-    by one before their share of the views, each, with the poses of its views, a little more off than the one before. At
-    the end one message moves every submap to where it belongs, and names its views by their stamps.
-
-    Parameters
-    ----------
-    folder, labels, split, frame_id, map_frame
-        As `FolderSource` takes them; the scene is the folder's `scene.ply`.
-    submaps : int
-        How many there are.
-
-    Raises
-    ------
-    GssegError
-        As `FolderSource` and `GaussianScene.load` do; `NoUsableViewsError` if there are fewer views than submaps.
+    The node has the whole scene of the folder, `scene.ply`. The first message leaves of it the first submap; the others
+    arrive one by one before their share of the views, each, with the poses of its views, a little more off than the one
+    before. At the end one message moves every submap to where it belongs, and names its views by their stamps. Raises
+    `GssegError`: as `FolderSource` and `GaussianScene.load` do; `NoUsableViewsError`: there are fewer views than
+    submaps.
     """
 
     def __init__(

@@ -72,23 +72,12 @@ class Stopped(Exception):
 class Topic:
     """A topic that does not run away from who listens: messages that have not arrived are kept, and no others follow.
 
-    Parameters
-    ----------
-    publisher : Publisher
-        Reliable; keeps `_QOS.depth` messages.
-    wait : callable
-        Waits until a time (s, `time.monotonic`); what it raises ends the wait for receivers.
-    say : callable
-        Gets, in one line, what is waited for where that takes long.
-
-    Attributes
-    ----------
-    published : int
-        Messages so far.
+    Its publisher is reliable, and keeps `_QOS.depth` messages. `wait` waits until a time (s, `time.monotonic`), and
+    ends the wait for receivers by what it raises; `say` is told, in one line, what is waited for where that takes long.
     """
 
     def __init__(self, publisher: Any, wait: Callable[[float], None], say: Callable[[str], object]) -> None:
-        self.publisher, self.published = publisher, 0
+        self.publisher, self.published = publisher, 0  # messages so far
         self._wait, self._say, self._unheard, self._patience_s = wait, say, 0, _PATIENCE_S
 
     def publish(self, message: Any) -> None:

@@ -69,27 +69,9 @@ class Source(Protocol):
 class FolderSource:
     """The views of a dataset folder, each a group of mask, camera_info, pose and, where there is a photo, image.
 
-    Parameters
-    ----------
-    folder : path
-        The dataset. Its scene's frame is the map frame.
-    labels : str
-        Sub-folder of the label images.
-    split : str
-        "train", "test" or "all".
-    frame_id, map_frame : str
-        Frame of the camera, and that in which the poses are.
-
-    Attributes
-    ----------
-    without_mask : list of str
-        Names of the views that are left out because they have no label image.
-
-    Raises
-    ------
-    GssegError
-        As `Dataset` does; `NoUsableViewsError` if no view is left. While iterating: `MaskFormatError`,
-        `MaskSizeError`, `UnknownLabelError` or `PhotoFileError` for a broken file.
+    The scene's frame is the map frame; `split` is "train", "test" or "all". Views without a label image in the
+    sub-folder `labels` are left out. Raises `GssegError`: as `Dataset` does; `NoUsableViewsError`: no view is left.
+    While iterating, `MaskFormatError`, `MaskSizeError`, `UnknownLabelError` or `PhotoFileError`: a file is broken.
     """
 
     def __init__(self, folder: str | os.PathLike[str], labels: str, split: str, frame_id: str, map_frame: str) -> None:
@@ -103,6 +85,7 @@ class FolderSource:
                 f"(train has {len(dataset.views('train'))}, test has {len(dataset.views('test'))})"
             )
         self._views = [view for view in views if view.has_mask]
+        # Names of those that are left out.
         self.without_mask = [view.name for view in views if not view.has_mask]
         if not self._views:
             raise NoUsableViewsError(
@@ -131,22 +114,8 @@ class FolderSource:
 class BagSource:
     """The topics of a recorded bag, mcap or sqlite3; messages go out as the bytes that were recorded.
 
-    Parameters
-    ----------
-    path : path
-        Folder of the bag, or its one .mcap or .db3 file.
-    topics : mapping from a key of `TYPES` to a name
-        Which topic of the bag it is; "" for the one of its type whose name ends in the key.
-
-    Attributes
-    ----------
-    topics : dict
-        The names that were found; without "image" if the bag has none.
-
-    Raises
-    ------
-    BagFileError
-        The bag is missing or broken, or a topic is missing or ambiguous. Also while iterating.
+    `topics` says by key of `TYPES` which topic of the bag it is; "" for the one of its type whose name ends in the key.
+    Raises `BagFileError`: the bag is missing or broken, or a topic is missing or ambiguous; also while iterating.
     """
 
     def __init__(self, path: str | os.PathLike[str], topics: Mapping[str, str]) -> None:
@@ -157,6 +126,7 @@ class BagSource:
             )
         with self._open() as reader:
             found = {role: _choose(self._path, reader.connections, role, topics.get(role, "")) for role in TYPES}
+        # As they were found; without "image" if the bag has none.
         self.topics = {role: name for role, name in found.items() if name is not None}
         self.description = f"bag {path} ({', '.join(self.topics.values())})"
 

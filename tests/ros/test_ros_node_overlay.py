@@ -32,8 +32,7 @@ from gsseg_msgs.msg import ObjectArray
 from sensor_msgs.msg import Image
 from std_msgs.msg import Header
 
-from gsseg_ros.color_images import color_from_image
-from gsseg_ros.conversions import picture_from_image, rgb_image
+from gsseg_ros.conversions import color_from_image, picture_from_image, rgb_image
 from gsseg_ros.frames import Similarity
 from gsseg_ros.node import live_outputs
 from gsseg_ros.node.live_outputs import LiveOutputs

@@ -11,8 +11,7 @@ from pairing_events import MS, S, expire, pose
 from gsseg_core.errors import SettingsError
 from gsseg_core.scene.camera import rigid_motion
 from gsseg_ros.node.pairing import Pairing
-from gsseg_ros.node.pose_frames import PoseFrames
-from gsseg_ros.node.pose_sources import GivenPose, InterpolatedPoses, MessagePoses, TfFirst
+from gsseg_ros.node.pose_sources import GivenPose, InterpolatedPoses, MessagePoses, PoseFrames, TfFirst
 
 HAS_TF = importlib.util.find_spec("tf2_ros") is not None
 

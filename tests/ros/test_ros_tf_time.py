@@ -18,8 +18,7 @@ from geometry_msgs.msg import TransformStamped
 
 from gsseg_ros.conversions import stamp_message, stamp_ns
 from gsseg_ros.node.pairing import Pairing
-from gsseg_ros.node.pose_frames import PoseFrames
-from gsseg_ros.node.pose_sources import GivenPose, MessagePoses
+from gsseg_ros.node.pose_sources import GivenPose, MessagePoses, PoseFrames
 from gsseg_ros.node.tf_poses import TfPoses
 
 LATE = 7  # Masks of a slow segmenter that are under way.

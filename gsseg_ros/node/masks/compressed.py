@@ -12,8 +12,7 @@ from sensor_msgs.msg import CompressedImage, Image
 from gsseg_core.data.label_images import png_header
 from gsseg_core.errors import MaskFormatError
 from gsseg_core.files.input_files import decode_image
-from gsseg_ros.conversions import plain_image
-from gsseg_ros.node.size_limits import require_size
+from gsseg_ros.conversions import plain_image, require_size
 
 TRANSPORTS = ("raw", "compressed")
 """Values of the parameters `mask_transport` and `image_transport`."""
@@ -31,12 +30,8 @@ def compressed_topic(node: Node, topic: str) -> str:
 def decompress_mask(message: CompressedImage, topic: str, max_pixels: int) -> Image:
     """Make a plain image of a compressed mask: of a PNG, whose size is looked at before it is inflated.
 
-    Raises
-    ------
-    MaskFormatError
-        It is broken, no PNG, or a PNG of something else than labels or colours.
-    TooManyPixelsError
-        It has more pixels than allowed.
+    Raises `MaskFormatError`: it is broken, no PNG, or a PNG of something else than labels or colours;
+    `TooManyPixelsError`: it has more pixels than allowed.
     """
     data = bytes(message.data)
     if data.startswith(_JPEG):

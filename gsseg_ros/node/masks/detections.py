@@ -82,10 +82,7 @@ ADAPTERS = {
 def checked_name(name: str, number: object, topic: str) -> str:
     """Return the name of a detection's class; one after its number where it has none.
 
-    Raises
-    ------
-    MaskFormatError
-        The name is no line of text.
+    Raises `MaskFormatError`: the name is no line of text.
     """
     if not name:
         return class_name({0: BACKGROUND_NAME}, int(str(number)))

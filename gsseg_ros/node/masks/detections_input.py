@@ -18,22 +18,10 @@ _WAITING = 30  # Masks, and detections, that wait for each other.
 
 
 class DetectionsInput:
-    """Detections of one camera; each goes on once it is whole.
+    """Detections of one camera, on a topic by its full name; each goes on to `forward` once it is whole.
 
-    Parameters
-    ----------
-    node : Node
-        Knows who publishes.
-    topic : str
-        Of the detections, as it is resolved.
-    listen : callable
-        Subscribes to them: gets the type of messages, and what takes these.
-    listen_to_mask : callable
-        Subscribes to the masks that belong to them: gets what takes these.
-    forward : callable
-        Gets the name of the topic and what was `Detected`.
-    lost : callable
-        Gets the reason, and the explanation, for one that went on without its other part.
+    `listen` subscribes to them, once their type is known, and `listen_to_mask` to the masks that belong to them. `lost`
+    is told why, and in which words, one went on without its other part.
     """
 
     def __init__(

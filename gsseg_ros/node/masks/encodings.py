@@ -11,8 +11,7 @@ from sensor_msgs.msg import Image
 from gsseg_core.data.soft_masks import SeenLabels, quantise
 from gsseg_core.errors import MaskFormatError
 from gsseg_core.text import counted
-from gsseg_ros.color_images import color_from_image
-from gsseg_ros.conversions import MASK_ENCODINGS, labels_from_image, pixels_of
+from gsseg_ros.conversions import MASK_ENCODINGS, color_from_image, labels_from_image, pixels_of
 from gsseg_ros.node.masks.palette import Palette
 
 COLORS = ("rgb8", "bgr8")
@@ -23,12 +22,8 @@ def mask_from_image(message: Image, topic: str, palette: Palette | None = None) 
     """Read a mask: labels as `labels_from_image` reads them, probabilities (32FC2 and up) or colours of a palette.
 
     Channel k of 32FC(K) is the probability of class k, from 0 to 1, and what the K of a pixel lack to 1 is unknown.
-
-    Raises
-    ------
-    MaskFormatError
-        Another encoding, a size of zero, data too short, a label out of range, numbers that are no probabilities, or a
-        colour that is not in the palette.
+    Raises `MaskFormatError`: another encoding, a size of zero, data too short, a label out of range, numbers that are
+    no probabilities, or a colour that is not in the palette.
     """
     encoding = message.encoding
     if probabilities := _PROBABILITIES.fullmatch(encoding):

@@ -1,4 +1,4 @@
-"""Adapter of vision_msgs/LabelInfo: names of a segmenter's labels in, and those of the classes out.
+"""vision_msgs/LabelInfo: names of a segmenter's labels in, on `label_info`, and those of the classes out.
 
 Messages are only looked at by the names of their fields, so that vision_msgs is needed for topics alone.
 """
@@ -8,11 +8,19 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
+from rclpy.callback_groups import CallbackGroup
+from rclpy.node import Node
+from rclpy.qos_overriding_options import QoSOverridingOptions
 from std_msgs.msg import Header
 
-from gsseg_core.data.class_names import flaw_of_class_name
+from gsseg_core.data.class_names import flaw_of_class_name, listed
 from gsseg_core.files.limits import MAX_LABEL
 from gsseg_ros.errors import LabelInfoError
+from gsseg_ros.node.complaints import REFUSED_LABELS, Complaints
+from gsseg_ros.node.masks.label_space import LabelSpace
+from gsseg_ros.qos import clear_overrides, latched
+
+TOPIC = "label_info"
 
 
 def label_info_class() -> Any | None:
@@ -27,10 +35,7 @@ def label_info_class() -> Any | None:
 def names_of(message: Any, topic: str) -> dict[int, str]:
     """Read the names of labels.
 
-    Raises
-    ------
-    LabelInfoError
-        There are none, a label has two names, or a name is no line of text.
+    Raises `LabelInfoError`: there are none, a label has two names, or a name is no line of text.
     """
     names: dict[int, str] = {}
     for entry in message.class_map:
@@ -52,3 +57,37 @@ def label_info(names: Mapping[int, str], header: Header) -> Any:
 
     class_map = [VisionClass(class_id=k, class_name=name) for k, name in sorted(names.items())]
     return LabelInfo(header=header, class_map=class_map)
+
+
+class LabelInfoInput:
+    """Hears names of labels. It is none of the inputs that are missed: they come once, if at all."""
+
+    def __init__(self, node: Node, label_space: LabelSpace, group: CallbackGroup, complaints: Complaints) -> None:
+        self._node, self._label_space, self._complaints = node, label_space, complaints
+        self._subscription: Any = None
+        if (kind := label_info_class()) is not None:
+            with clear_overrides(TOPIC):
+                self._subscription = node.create_subscription(
+                    kind,
+                    TOPIC,
+                    self.on_label_info,
+                    latched(),
+                    callback_group=group,
+                    qos_overriding_options=QoSOverridingOptions.with_default_policies(),
+                )
+
+    def on_label_info(self, message: Any) -> None:
+        """Take in names."""
+        topic = self._node.resolve_topic_name(TOPIC)
+        try:
+            names = names_of(message, topic)
+        except LabelInfoError as error:
+            self._complaints.add(REFUSED_LABELS, str(error))
+            return
+        if self._label_space.hear(names):
+            self._node.get_logger().info(f"{topic}: labels are called {listed(names.values())}")
+
+    def close(self) -> None:
+        """Stop to listen."""
+        if self._subscription is not None:
+            self._node.destroy_subscription(self._subscription)

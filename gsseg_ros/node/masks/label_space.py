@@ -42,29 +42,16 @@ class NewNames:
 class LabelSpace:
     """Turns labels of masks into classes of a session. Its methods may be called from any thread.
 
-    Parameters
-    ----------
-    class_names : sequence of str
-        The classes by id, if they are declared.
-    new_names : NewNames, optional
-        Of the label map.
-    max_classes : int
-        Without `class_names`: labels that have no name may be so many.
-
-    Attributes
-    ----------
-    classes : dict of int to str
-        The classes, if they are declared: `class_names`, and after them what else the label map makes.
-    heard : dict of int to str, or None
-        The names of labels that `label_info` told last.
+    `max_classes` holds without `class_names`: labels that have no name may be so many.
     """
 
     def __init__(self, class_names: tuple[str, ...], new_names: NewNames | None, max_classes: int) -> None:
         self._class_names, self._new_names, self._max_classes = dict(enumerate(class_names)), new_names, max_classes
         made = [] if new_names is None else [name for name in new_names.given.values() if name is not None]
         known = dict.fromkeys(class_names)
+        # The classes by id, if they are declared: `class_names`, and after them what else the label map makes.
         self.classes = dict(enumerate(known | dict.fromkeys(made))) if class_names else {}
-        self.heard: dict[int, str] | None = None
+        self.heard: dict[int, str] | None = None  # the names of labels that `label_info` told last
         self._said: set[str] = set()  # Names that are none of the classes: detections bring others with every image.
 
     def hear(self, names: Mapping[int, str]) -> bool:
@@ -82,27 +69,11 @@ class LabelSpace:
         source: str,
         say: Callable[[str], None],
     ) -> SeenLabels:
-        """Turn the labels of a mask into classes of the session.
+        """Turn the labels of a mask into classes of the session, which gets new ones unless they are declared.
 
-        Parameters
-        ----------
-        seen : SeenLabels
-            The mask.
-        names : mapping from label to name, or None
-            Those that came with the mask.
-        session : LiveSession
-            Gets classes that it did not have, unless its classes are declared.
-        source : str
-            What messages call the mask.
-        say : callable
-            Gets what a person should know.
-
-        Raises
-        ------
-        LabelMapError
-            The label map names a class that the segmenter does not have.
-        UnknownLabelError
-            The mask holds a label that has no name.
+        `names` are those that came with the mask, which messages call `source`; `say` is told what a person should
+        know. Raises `LabelMapError`: the label map names a class that the segmenter does not have; `UnknownLabelError`:
+        the mask holds a label that has no name.
         """
         if names is not None:
             new_names = {k: self._new_names.of(name) if self._new_names else name for k, name in names.items()}

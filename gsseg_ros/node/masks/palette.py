@@ -18,17 +18,9 @@ _PLACES = np.array([1 << 16, 1 << 8, 1], np.int32)
 
 
 class Palette:
-    """Colours by label.
+    """Colours by label: such as "#0080ff", red, green and blue in hexadecimal; the index is the label.
 
-    Parameters
-    ----------
-    colors : sequence of str
-        Such as "#0080ff", red, green and blue in hexadecimal; the index is the label.
-
-    Raises
-    ------
-    SettingsError
-        One is no colour, occurs twice, or there are more than labels.
+    Raises `SettingsError`: one is no colour, occurs twice, or there are more than labels.
     """
 
     def __init__(self, colors: Sequence[str]) -> None:
@@ -59,11 +51,8 @@ class Palette:
     ) -> npt.NDArray[np.int32]:
         """Look up the labels (H, W) of the colours of a mask.
 
-        Raises
-        ------
-        MaskFormatError
-            A colour is not in the palette. Then either the palette is another segmenter's, or colours were blended, by
-            scaling or as JPEG, and the labels of other pixels would be wrong, too.
+        Raises `MaskFormatError`: a colour is not in the palette. Then either the palette is another segmenter's, or
+        colours were blended, by scaling or as JPEG, and the labels of other pixels would be wrong, too.
         """
         codes = pixels @ _PLACES  # (H, W)
         place = np.minimum(np.searchsorted(self._codes, codes), len(self._codes) - 1)

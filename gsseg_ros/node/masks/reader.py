@@ -12,23 +12,19 @@ from gsseg_core.data.label_images import PER_VIEW, UNKNOWN
 from gsseg_core.data.soft_masks import SeenLabels
 from gsseg_core.live.session import LiveSession
 from gsseg_ros.camera_infos import image_size
+from gsseg_ros.conversions import require_size
 from gsseg_ros.node.masks.compressed import decompress_mask
 from gsseg_ros.node.masks.detections import Beside, Detected
 from gsseg_ros.node.masks.encodings import mask_from_image
 from gsseg_ros.node.masks.label_space import LabelSpace
 from gsseg_ros.node.parameters import Settings
-from gsseg_ros.node.size_limits import require_size
 
 
 def read_image(message: Image | CompressedImage, topic: str, settings: Settings) -> SeenLabels:
     """Read a mask as it was sent, by the node's parameters; its labels are the segmenter's.
 
-    Raises
-    ------
-    MaskFormatError
-        It is of another encoding, or broken.
-    TooManyPixelsError
-        It has more pixels than the parameter max_pixels allows.
+    Raises `MaskFormatError`: it is of another encoding, or broken; `TooManyPixelsError`: it has more pixels than the
+    parameter max_pixels allows.
     """
     if isinstance(message, CompressedImage):
         message = decompress_mask(message, topic, settings.max_pixels)
@@ -37,17 +33,7 @@ def read_image(message: Image | CompressedImage, topic: str, settings: Settings)
 
 
 class MaskReader:
-    """Reads masks by the node's parameters.
-
-    Parameters
-    ----------
-    settings : Settings
-        Of the node.
-    label_space : LabelSpace
-        What labels mean.
-    say : callable
-        Gets what a person should know.
-    """
+    """Reads masks by the node's parameters; `say` is told what a person should know."""
 
     def __init__(self, settings: Settings, label_space: LabelSpace, say: Callable[[str], None]) -> None:
         self._settings, self._label_space, self._say = settings, label_space, say
@@ -55,23 +41,9 @@ class MaskReader:
     def read(self, message: Any, topic: str, session: LiveSession, info: CameraInfo) -> SeenLabels:
         """Read a mask, an Image, a CompressedImage or `Detected`; (H, W), with evidence where it is soft.
 
-        Parameters
-        ----------
-        message : Image, CompressedImage or Detected
-            The mask.
-        topic : str
-            Where it came.
-        session : LiveSession
-            Whose classes it is to have; it may get new ones.
-        info : CameraInfo
-            Of the camera.
-
-        Raises
-        ------
-        MaskFormatError, UnknownLabelError, LabelMapError
-            It is of another encoding, broken, or its labels have no meaning.
-        TooManyPixelsError
-            It has more pixels than the parameter max_pixels allows.
+        The session, whose classes it gets, may get new ones. Raises `MaskFormatError`, `UnknownLabelError`,
+        `LabelMapError`: it is of another encoding, broken, or its labels have no meaning; `TooManyPixelsError`: it has
+        more pixels than the parameter max_pixels allows.
         """
         if isinstance(message, Detected):
             return self._read_detections(message, topic, session, info)

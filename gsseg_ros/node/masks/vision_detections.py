@@ -19,25 +19,11 @@ from gsseg_ros.node.masks.detections import Beside, NamedMask, check_count, chec
 
 
 def named_mask(message: Any, topic: str, beside: Beside) -> NamedMask:
-    """Name the labels (H, W) of a mask by detections, each by its likeliest hypothesis.
+    """Name the labels (H, W) of a mask by detections (Detection2DArray), each by its likeliest hypothesis.
 
     Where the ids of all detections are whole numbers from 1 on, a mask holds these; else label k is the k-th detection.
-
-    Parameters
-    ----------
-    message : vision_msgs.msg.Detection2DArray
-        The detections.
-    topic : str
-        What messages call them.
-    beside : Beside
-        With the labels of their mask, and names for hypotheses whose class_id is a number.
-
-    Raises
-    ------
-    UnknownLabelError
-        The mask has labels that are no detections.
-    MaskFormatError
-        Detections have no hypothesis, or their names are no line of text.
+    Hypotheses whose class_id is a number are called as `beside.heard` has it. Raises `UnknownLabelError`: the mask has
+    labels that are no detections; `MaskFormatError`: detections have no hypothesis, or their names are no line of text.
     """
     if beside.labels is None:
         raise AssertionError("this adapter takes a mask")

@@ -14,8 +14,8 @@ from gsseg_core.data.class_names import BACKGROUND_NAME
 from gsseg_core.data.mask_formats.shapes import Polygons, Shape, paint
 from gsseg_core.errors import MaskFormatError
 from gsseg_core.files.limits import LIMITS
+from gsseg_ros.conversions import require_size
 from gsseg_ros.node.masks.detections import Beside, NamedMask, check_count, checked_name
-from gsseg_ros.node.size_limits import require_size
 
 
 class Size(NamedTuple):
@@ -26,23 +26,11 @@ class Size(NamedTuple):
 
 
 def named_mask(message: Any, topic: str, beside: Beside) -> NamedMask:
-    """Paint the polygons of detections, the surest on top; label k is the k-th detection, 0 where there is none.
+    """Paint polygons (DetectionArray), the surest on top; label k is the k-th detection, 0 where there is none.
 
-    Parameters
-    ----------
-    message : yolo_msgs.msg.DetectionArray
-        The detections.
-    topic : str
-        What messages call them.
-    beside : Beside
-        Its size is that of the mask where nothing was detected.
-
-    Raises
-    ------
-    TooManyPixelsError
-        The image has more pixels than allowed.
-    MaskFormatError
-        They have boxes alone, or polygons that are none, or are of images of different sizes.
+    Where nothing was detected, the mask has the size of `beside`. Raises `TooManyPixelsError`: the image has more
+    pixels than allowed; `MaskFormatError`: they have boxes alone, or polygons that are none, or are of images of
+    different sizes.
     """
     detections = list(message.detections)
     check_count(len(detections), topic)
