@@ -25,6 +25,7 @@ _UNCLEAR_NS = 10 * SECOND
 _DEPTH_BYTES = 64 << 20  # At 30 Hz, VGA and 16 bit, those of three seconds.
 _HELD_BACK = 30  # Messages, by `Timeline`.
 _RARE_S = 1.0
+_LONG_S = 1.0  # Whoever has waited for longer is looked at by `expire` alone, unless a message of its stamp comes.
 _LONGEST_STEP_S = 0.5
 
 MOST_BYTES = 256 << 20
@@ -238,8 +239,11 @@ class Pairing:
             if stream == MASK:
                 self._await(stamp, content, frame_id)
         if messages:
-            for key in sorted(self._waiting):
-                self._pair(key)
+            came = {message.stamp for message in messages}
+            for key, waiting in sorted(self._waiting.items()):
+                # Where TF is missing hundreds wait, and to look up all with each message would take half a core.
+                if key[0] in came or waiting.since is None or self._awake_s - waiting.since < _LONG_S:
+                    self._pair(key)
             while self._too_many():
                 self._pair(min(self._waiting), last_chance=True)
 

@@ -148,3 +148,21 @@ def test_masks_that_wait_to_be_fused_take_no_more_memory_than_is_said_and_the_ol
     go_on.set()
     worker.stop()
     assert handled == [1]
+
+
+def test_masks_that_wait_for_long_are_not_looked_up_with_every_message() -> None:
+    class NoTransforms(MessagePoses):
+        asked = 0
+
+        def at(self, *_: object) -> None:
+            self.asked += 1
+
+    poses = NoTransforms()
+    pairing = Pairing(poses)
+    send(pairing, [(kind, 2 * S + i * MS) for i in range(200) for kind in ("info", "mask")])
+    wait(pairing, 2)
+    before = poses.asked
+    send(pairing, [(kind, 3 * S + i * MS) for i in range(10) for kind in ("info", "mask")])
+    assert pairing.waiting == 210 and poses.asked - before < 200
+    send(pairing, [("info", 2 * S), ("mask", 4 * S)])
+    assert pairing.dropped.total() == 0
