@@ -35,20 +35,6 @@ def is_rectified(setting: str, *topics: str) -> bool:
     return setting == "true" or (setting == AUTO and any(_SAYS_RECTIFIED.search(topic) for topic in topics))
 
 
-def intrinsics_from_info(info: CameraInfo, topic: str) -> tuple[npt.NDArray[np.float64], int, int]:
-    """Read `K` (3, 3) in pixels, width and height of a pinhole camera, of the image that is cut out and binned.
-
-    Raises `IntrinsicsError`: the lens is distorted, the size zero, what is cut out not in the image, or `k` not that of
-    a pinhole camera.
-    """
-    if np.any(info.d):
-        raise IntrinsicsError(
-            f"{topic}: distortion d is {list(info.d)}; expected zeros: what is drawn is what a pinhole camera sees"
-        )
-    K, size = _matrix_of_window(info, np.reshape(info.k, (3, 3)), topic), image_size(info, topic)
-    return _scale(info, size, topic, topic) @ K, *size
-
-
 def image_size(info: CameraInfo, topic: str) -> tuple[int, int]:
     """Width and height of the images of a camera_info: its `roi`, in which `binning` makes one pixel of several.
 
@@ -68,12 +54,16 @@ def camera_from_messages(
     similarity: Similarity,
     topic: str,
 ) -> Camera:
-    """Build the scene's camera from a camera_info (of `topic`) and the pose of the optical frame in the map, in metres.
+    """Build the scene's camera of an undistorted view, from its camera_info and its pose in the map, in metres.
 
-    Raises `IntrinsicsError`, `PoseError`: the camera_info or the pose cannot be used.
+    Raises `IntrinsicsError`, `PoseError`: the camera_info, as that of a distorted lens, or the pose cannot be used.
     """
-    K, width, height = intrinsics_from_info(info, topic)
-    return Camera(name, width, height, K, similarity.world_to_camera(camera_in_map))
+    if np.any(info.d):
+        raise IntrinsicsError(
+            f"{topic}: distortion d is {list(info.d)}; expected zeros: what is drawn is what a pinhole camera sees"
+        )
+    K, size = _matrix_of_window(info, np.reshape(info.k, (3, 3)), topic), image_size(info, topic)
+    return Camera(name, *size, _scale(info, size, topic, topic) @ K, similarity.world_to_camera(camera_in_map))
 
 
 def camera_of_image(

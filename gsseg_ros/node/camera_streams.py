@@ -12,9 +12,11 @@ from nav_msgs.msg import Odometry
 from sensor_msgs.msg import CameraInfo, CompressedImage, Image
 
 from gsseg_core.errors import PoseError
+from gsseg_core.scene.camera import Camera
+from gsseg_ros.camera_infos import camera_of_image, is_rectified
 from gsseg_ros.conversions import matrix_from_pose, stamp_ns
 from gsseg_ros.node.masks.detections import Detected
-from gsseg_ros.node.pairing import Pairing, PairingSettings
+from gsseg_ros.node.pairing import Paired, Pairing, PairingSettings
 from gsseg_ros.node.parameters import Settings
 from gsseg_ros.node.pose_sources import GivenPose, InterpolatedPoses, MessagePoses, PoseFrames, PoseSource, TfFirst
 from gsseg_ros.node.tf_poses import TfPoses
@@ -32,6 +34,16 @@ class Listen(Protocol):
 def mask_class(settings: Settings) -> Any:
     """Class of the messages that masks come in."""
     return CompressedImage if settings.mask_transport == "compressed" else Image
+
+
+def camera_of(paired: Paired, size: tuple[int, int], settings: Settings) -> Camera:
+    """Make the scene's camera of a mask or picture of some size (width, height); raises as `camera_of_image` does."""
+    (topic, _), (info_topic, info) = paired.mask, paired.camera_info
+    pose, rectified = (
+        settings.scene_to_map.world_to_camera(paired.pose),
+        is_rectified(settings.rectified, topic, info_topic),
+    )
+    return camera_of_image(paired.name, info, size, pose, topic, info_topic, rectified=rectified)
 
 
 class CameraStreams:

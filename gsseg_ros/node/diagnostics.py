@@ -71,7 +71,7 @@ def namesakes(inputs: Inputs) -> str:
     found = counted(others, "other node has", "other nodes have")
     return (
         f"{found} this node's name: a request is worked on by each, and answered by the first; expected names of their "
-        "own (--ros-args -r __node:=... or __ns:=...), or, of one that was killed, to be forgotten within a minute"
+        "own (--ros-args -r __node:=... or __ns:=...); one that was killed is forgotten within a minute"
     )
 
 

@@ -19,10 +19,10 @@ from gsseg_core.data.soft_masks import SeenLabels
 from gsseg_core.data.view import View
 from gsseg_core.errors import GssegError
 from gsseg_core.live.results import SCENE_CHANGED, Rejection
-from gsseg_ros.camera_infos import camera_of_image, image_size, is_rectified
+from gsseg_ros.camera_infos import image_size
 from gsseg_ros.errors import DepthImageError, NoSceneError, TooManyPixelsError
 from gsseg_ros.node.camera_images import CameraImages
-from gsseg_ros.node.camera_streams import CameraStreams, mask_class
+from gsseg_ros.node.camera_streams import CameraStreams, camera_of, mask_class
 from gsseg_ros.node.complaints import DETECTIONS_TYPE, LIVE, PERIOD, REFUSED_POSE, Complaints
 from gsseg_ros.node.depth_images import gate_by_image
 from gsseg_ros.node.jobs import Worker
@@ -302,10 +302,8 @@ class Inputs:
 
     def _fused_in_place(self, paired: Paired, seen: SeenLabels) -> Rejection | None:
         (topic, _), (info_topic, info) = paired.mask, paired.camera_info
-        session, settings = self._workspace.session, self._workspace.settings
-        size, rectified = seen.labels.shape[::-1], is_rectified(settings.rectified, topic, info_topic)
-        pose = settings.scene_to_map.world_to_camera(paired.pose)
-        camera = camera_of_image(paired.name, info, size, pose, topic, info_topic, rectified=rectified)
+        size = seen.labels.shape[::-1]
+        camera = camera_of(paired, size, self._workspace.settings)
         if size != (said := image_size(info, info_topic)):
             self._say_once(
                 f"{topic}: masks are {size[0]} x {size[1]} pixels, {info_topic} says {said[0]} x {said[1]}: its "
@@ -320,7 +318,7 @@ class Inputs:
         view = View.from_seen(camera, seen)
         if paired.depth is not None:
             view = self._gated(view, paired)
-        rejection = session.fuse(view, paired.era)
+        rejection = self._workspace.session.fuse(view, paired.era)
         if rejection is None:
             self.live.fused(paired, camera)
         return rejection

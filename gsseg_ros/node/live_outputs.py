@@ -23,8 +23,8 @@ from gsseg_core.export.pictures import overlay, palette
 from gsseg_core.raster.backends import make_operator
 from gsseg_core.scene.camera import Camera
 from gsseg_core.segmentation import Segmentation
-from gsseg_ros.camera_infos import camera_of_image, is_rectified
 from gsseg_ros.conversions import color_from_image, require_size, rgb_image
+from gsseg_ros.node.camera_streams import camera_of
 from gsseg_ros.node.jobs import END_SECONDS
 from gsseg_ros.node.masks.compressed import decompress_picture
 from gsseg_ros.node.outputs import Outputs
@@ -169,9 +169,7 @@ class LiveOutputs:
             image = decompress_picture(image, topic, settings.max_pixels)
         for message, source in ((image, topic), (info, info_topic)):
             require_size(message, settings.max_pixels, source)
-        size, rectified = (image.width, image.height), is_rectified(settings.rectified, topic, info_topic)
-        pose = settings.scene_to_map.world_to_camera(paired.pose)
-        camera = camera_of_image(paired.name, info, size, pose, topic, info_topic, rectified=rectified)
+        camera = camera_of(paired, (image.width, image.height), settings)
         photo = color_from_image(image, topic)
         return camera, photo if camera.undistortion is None else camera.undistortion.sample(photo, 0)
 

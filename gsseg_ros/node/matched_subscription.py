@@ -56,7 +56,9 @@ class MatchedSubscription:
                 return
             self._node.destroy_subscription(self._subscription)
             self._quality, self._subscription = self._subscribe()
-        self._node.get_logger().info(f"{self.topic_name}: its publishers have changed; now {self.policies}")
+        self._node.get_logger().info(
+            f"{self.topic_name}: the QoS of its publishers has changed; subscribed again: {self.policies}"
+        )
 
     def close(self) -> None:
         """Stop to listen, for good."""

@@ -240,9 +240,10 @@ class Pairing:
                 self._await(stamp, content, frame_id)
         if messages:
             came = {message.stamp for message in messages}
-            for key, waiting in sorted(self._waiting.items()):
+            for key in sorted(self._waiting):
+                since = self._waiting[key].since
                 # Where TF is missing hundreds wait, and to look up all with each message would take half a core.
-                if key[0] in came or waiting.since is None or self._awake_s - waiting.since < _LONG_S:
+                if key[0] in came or since is None or self._awake_s - since < _LONG_S:
                     self._pair(key)
             while self._too_many():
                 self._pair(min(self._waiting), last_chance=True)

@@ -88,9 +88,7 @@ class PoseFrames:
 class PoseSource(Protocol):
     """Source of the poses of cameras in the map."""
 
-    @property
-    def knows_frames(self) -> bool:
-        """Whether it may tell cameras apart, by the frame_id of their masks."""
+    knows_frames: bool  # whether it may tell cameras apart, by the frame_id of their masks
 
     def at(self, stamp: int, frame_id: str = "", last_chance: bool = False, several: bool = False) -> Pose | None:
         """Find the pose (4, 4) at `stamp` of the camera whose masks carry `frame_id`; None if not known (yet).
@@ -116,16 +114,13 @@ class MessagePoses:
     only one of them is as close, that one is taken. Without `frames`, poses are those of cameras in the map.
     """
 
+    knows_frames = False  # A message does not say of which camera it is.
+
     def __init__(self, tolerance_s: float = 0.0, frames: PoseFrames | None = None) -> None:
         self._poses: History[int, GivenPose] = History(_POSES_KEPT)
         self._refused: History[int, None] = History(_POSES_KEPT)
         self._tolerance_ns, self._frames = round(tolerance_s * SECOND), frames
         self._bridges = self._tolerance_ns > 0  # Whether others may serve where one is missing.
-
-    @property
-    def knows_frames(self) -> bool:
-        """False: a message does not say of which camera it is."""
-        return False
 
     def add(self, stamp: int, given: GivenPose) -> None:
         """Keep the pose of a stamp; of two with the same stamp the first stays."""
@@ -186,12 +181,7 @@ class InterpolatedPoses(MessagePoses):
 
     def __init__(self, max_gap_s: float = 0.2, frames: PoseFrames | None = None, tells_apart: bool = False) -> None:
         super().__init__(0.0, frames)
-        self._max_gap_ns, self._tells_apart, self._bridges = round(max_gap_s * SECOND), tells_apart, True
-
-    @property
-    def knows_frames(self) -> bool:
-        """Whether cameras are told apart by where they are on the robot."""
-        return self._tells_apart
+        self._max_gap_ns, self.knows_frames, self._bridges = round(max_gap_s * SECOND), tells_apart, True
 
     def _given(self, stamp: int, last_chance: bool) -> GivenPose | None:
         exact, stamps = self._poses.values.get(stamp), self._poses.stamps
@@ -205,14 +195,11 @@ class InterpolatedPoses(MessagePoses):
 class TfFirst(MessagePoses):
     """Poses that TF knows at the mask's stamp, and else those of messages."""
 
+    knows_frames = True  # TF is asked alone where that matters.
+
     def __init__(self, tf: PoseSource, tolerance_s: float = 0.0, frames: PoseFrames | None = None) -> None:
         super().__init__(tolerance_s, frames)
         self._tf = tf
-
-    @property
-    def knows_frames(self) -> bool:
-        """True: TF tells cameras apart, and is asked alone where that matters."""
-        return True
 
     def at(self, stamp: int, frame_id: str = "", last_chance: bool = False, several: bool = False) -> Pose | None:
         """Find the pose (4, 4) as `PoseSource` says."""

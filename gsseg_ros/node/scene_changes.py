@@ -117,7 +117,10 @@ class SceneChanges:
     def _require_current(self, session: LivingSession) -> None:
         """Raise `InvalidRequestError` where another scene was loaded while a file was read."""
         if self.workspace.loaded is not session:
-            raise InvalidRequestError("another scene was loaded meanwhile, and is unchanged; expected one that stays")
+            raise InvalidRequestError(
+                "another scene was loaded meanwhile, and was not changed; expected the request again, if it is for "
+                "that one"
+            )
 
 
 def _with_names(delta: SceneDelta, session: LivingSession, own: Container[str]) -> SceneDelta:

@@ -106,7 +106,7 @@ class SegmentNode(LifecycleNode):
             if self.trigger_configure() == TransitionCallbackReturn.SUCCESS:
                 self.trigger_activate()
         except RuntimeError as error:
-            self.get_logger().warning(f"autostart gives way to somebody else's transition: {error}")
+            self.get_logger().warning(f"autostart stops: somebody else has asked for a lifecycle transition ({error})")
 
     def on_configure(self, state: LifecycleState) -> TransitionCallbackReturn:
         """Read the parameters and load the scene; where that fails all is as it was before."""
@@ -147,7 +147,7 @@ class SegmentNode(LifecycleNode):
             step()
         except Exception as error:
             self.get_logger().error(f"cannot be {what}: {describe(error)}")
-            if undo is not None and self._attempt("left as it was before", undo) == SUCCESS:
+            if undo is not None and self._attempt("taken back to the state before", undo) == SUCCESS:
                 return TransitionCallbackReturn.FAILURE
             return TransitionCallbackReturn.ERROR
         return SUCCESS
@@ -276,7 +276,10 @@ class SegmentNode(LifecycleNode):
         left = session.num_fused - session.num_views
         notes = ["; ~/learn learns from where views are now"] * (session.learnt is not None)
         notes += [f"; votes of {left} that are not kept any more stay as they were"] * (left > 0)
-        self.get_logger().info(f"the scene was moved, and {following} views have followed{''.join(notes)}")
+        self.get_logger().info(
+            f"scene_to_map has changed: votes of {following} views were cast anew from where their cameras are in "
+            f"the scene now{''.join(notes)}"
+        )
         if outputs.latched is None:
             inputs.live.show_objects()
         else:

@@ -94,8 +94,8 @@ class Workspace:
         """
         if not isinstance(session := self.session, LivingSession):
             raise InvalidRequestError(
-                "the parameter ids is per-view: objects that the node finds itself are of the scene as it was, and of "
-                "this robot alone; expected ids given, or to load the new scene"
+                "the parameter ids is per-view: objects that the node finds itself cannot follow a change of the "
+                "scene, nor be merged with another robot's; expected ids given, or ~/load_scene with the new scene"
             )
         return session
 

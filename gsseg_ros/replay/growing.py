@@ -9,9 +9,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 
-from gsseg_core.data.view import View
 from gsseg_core.errors import NoUsableViewsError
 from gsseg_core.scene.gaussian_scene import GaussianScene
 from gsseg_core.scene.group_frames import moved_scene
@@ -63,7 +61,7 @@ class GrowingSource(FolderSource):
             yield Group(due, ((SCENE_DELTA, message_from_delta(self._arrival(i))),))
             infos = []
             for view in views:
-                messages = tuple(self._messages(_moved(view, drift)))
+                messages = tuple(self._messages(replace(view, camera=drift.camera(view.camera))))
                 infos += [message for topic, message in messages if topic == "camera_info"]
                 yield Group(due, messages)
                 due += 1
@@ -81,19 +79,11 @@ class GrowingSource(FolderSource):
         """Make the change that submap i arrives with."""
         part = np.sort(self._parts[i])
         if i == 0:
-            return SceneDelta(revision=1, removed=_ids(np.setdiff1d(np.arange(len(self._scene)), part)))
+            return SceneDelta(revision=1, removed=np.setdiff1d(np.arange(len(self._scene)), part))
         # A group's frame is that of the scene at first: it arrives where SLAM believes it to be.
         added = moved_scene(self._scene.subset(part), self._drifts[i])
         groups = np.full(len(part), i, np.int64)
-        return SceneDelta(revision=i + 1, added=added, added_ids=_ids(part), added_groups=groups)
-
-
-def _ids(places: npt.NDArray[Any]) -> npt.NDArray[np.int64]:
-    return np.asarray(places, np.int64)
-
-
-def _moved(view: View, drift: Similarity) -> View:
-    return replace(view, camera=drift.camera(view.camera))
+        return SceneDelta(revision=i + 1, added=added, added_ids=part, added_groups=groups)
 
 
 def _drift(i: int, size: float) -> Similarity:

@@ -23,7 +23,6 @@ from gsseg_ros.camera_infos import (
     camera_from_messages,
     camera_of_image,
     image_size,
-    intrinsics_from_info,
     is_rectified,
 )
 from gsseg_ros.conversions import (
@@ -35,6 +34,12 @@ from gsseg_ros.conversions import (
     viewpoint_messages,
 )
 from gsseg_ros.frames import Similarity, rotation_from_quaternion
+
+
+def intrinsics_from_info(message: CameraInfo, topic: str) -> tuple[np.ndarray, int, int]:
+    """Intrinsic matrix, width and height of an undistorted view."""
+    camera = camera_from_messages("view", message, np.eye(4), IDENTITY, topic)
+    return camera.K, camera.width, camera.height
 
 
 def test_intrinsics_are_taken_as_they_stand() -> None:

@@ -30,7 +30,7 @@ from rosbags.typesys import Stores, get_typestore
 from sensor_msgs.msg import CameraInfo, Image
 from std_msgs.msg import Header
 
-from gsseg_ros.camera_infos import intrinsics_from_info
+from gsseg_ros.camera_infos import camera_from_messages
 from gsseg_ros.conversions import (
     camera_info,
     labels_from_image,
@@ -40,6 +40,7 @@ from gsseg_ros.conversions import (
     stamp_message,
     stamp_ns,
 )
+from gsseg_ros.frames import Similarity
 from gsseg_ros.replay.replay_node import _PARAMETERS, _with_parameters, make_source
 from gsseg_ros.replay.sources import BagSource, FolderSource, PhotoFileError
 
@@ -144,9 +145,9 @@ def test_a_folder_gives_the_views_of_the_split_in_order_with_equal_stamps(ros: R
     for view, mask, info, pose in zip(views, heard["mask"], heard["camera_info"], heard["pose"], strict=True):
         assert mask.encoding == "mono8" and mask.header.frame_id == info.header.frame_id == "camera"
         np.testing.assert_array_equal(labels_from_image(mask, "mask"), view.read_labels())
-        K, width, height = intrinsics_from_info(info, "camera_info")
-        assert (width, height) == (view.camera.width, view.camera.height)
-        np.testing.assert_array_equal(K, view.camera.K)
+        camera = camera_from_messages("view", info, np.eye(4), Similarity(), "camera_info")
+        assert (camera.width, camera.height) == (view.camera.width, view.camera.height)
+        np.testing.assert_array_equal(camera.K, view.camera.K)
         camera_in_map = matrix_from_pose(pose.pose, "pose")
         assert pose.header.frame_id == "world"
         np.testing.assert_allclose(camera_in_map @ view.camera.world_to_camera, np.eye(4), atol=1e-9)
@@ -373,8 +374,8 @@ def test_a_folder_of_bent_images_is_replayed_as_what_a_pinhole_sees(tmp_path: Pa
     messages = dict(sent)
     sizes = {(messages[role].width, messages[role].height) for role in ("mask", "image", "camera_info")}
     assert len(sizes) == 1 and (64, 48) not in sizes
-    K, *_ = intrinsics_from_info(messages["camera_info"], "camera_info")
-    assert (K[0, 0], K[1, 1]) == (40, 40)
+    camera = camera_from_messages("view", messages["camera_info"], np.eye(4), Similarity(), "camera_info")
+    assert (camera.fx, camera.fy) == (40, 40)
     Picture.fromarray(photo()[1:]).save(tmp_path / "images" / "0001.png")
     with pytest.raises(PhotoFileError, match=r"0001\.png: image is 64 x 47 pixels; expected 64 x 48"):
         list(FolderSource(tmp_path, "labels", "train", "camera", "map"))
