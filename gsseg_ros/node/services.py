@@ -194,8 +194,10 @@ class Services:
     def pick(self, request: Pick.Request, response: Pick.Response) -> None:
         """Pick one object of one view."""
         settings, scene = self.workspace.settings, self.workspace.session.scene
-        topics = [self.node.resolve_topic_name(name) for name in ("mask", "camera_info")]
-        rectified = is_rectified(settings.rectified, *topics)
+        inputs = (
+            [f"{camera}/{role}".lstrip("/") for role in ("mask", "camera_info")] for camera in settings.cameras or ("",)
+        )
+        rectified = all(is_rectified(settings.rectified, *map(self.node.resolve_topic_name, names)) for names in inputs)
         with self.workspace.run("pick") as run:
             with run.watch.stage("pick"):
                 picked = pick_object(request, scene, settings, self._lookup(), rectified=rectified)

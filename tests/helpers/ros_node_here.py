@@ -37,7 +37,7 @@ class NodeHere:
         Of the next view, in nanoseconds; it begins at the same time in every node, as in a simulator.
     """
 
-    def __init__(self, ros: Ros, parameters: Mapping[str, Any]) -> None:
+    def __init__(self, ros: Ros, parameters: Mapping[str, Any], remapping: Iterable[str] = ()) -> None:
         self.stamp = 1000 * SECOND
         values = {
             name: value if isinstance(value, list | int | float) else str(value) for name, value in parameters.items()
@@ -45,6 +45,7 @@ class NodeHere:
         self.node = SegmentNode(
             context=ros.context,
             use_global_arguments=False,
+            cli_args=["--ros-args", *(text for rule in remapping for text in ("-r", rule))],
             parameter_overrides=[Parameter(name, value=value) for name, value in values.items()],
         )
         self.configure()
@@ -109,9 +110,9 @@ class NodeHere:
 
 
 @contextmanager
-def node_here(ros: Ros, parameters: Mapping[str, Any]) -> Iterator[NodeHere]:
-    """A node that is gone after the body."""
-    here = NodeHere(ros, parameters)
+def node_here(ros: Ros, parameters: Mapping[str, Any], remapping: Iterable[str] = ()) -> Iterator[NodeHere]:
+    """A node that is gone after the body; `remapping` has rules such as "mask:=/segmenter/mask"."""
+    here = NodeHere(ros, parameters, remapping)
     try:
         yield here
     finally:

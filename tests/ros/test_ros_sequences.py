@@ -17,13 +17,11 @@ pytest.importorskip("gsseg_msgs.msg", reason="gsseg_msgs is not installed")
 
 from gsseg_msgs.action import Learn
 from gsseg_msgs.msg import ObjectArray
-from rclpy.lifecycle import TransitionCallbackReturn
 from rclpy.parameter import Parameter
 from sensor_msgs.msg import PointCloud2
 
 from gsseg_ros.node import live_outputs, services
 from gsseg_ros.node.reports import Selection
-from gsseg_ros.node.segment_node import SegmentNode
 
 SIDES = ("left", "right")
 
@@ -87,21 +85,23 @@ def test_views_that_come_while_a_run_works_are_in_the_objects_in_the_end(
 
 
 def test_topics_of_two_cameras_can_be_exchanged_by_remapping(ros: Ros, parameters: dict[str, Any]) -> None:
-    values = {**parameters, "cameras": ["left", "right"], "detections_topic": "found", "ids": "given"}
+    values = {**parameters, "cameras": list(SIDES), "detections_topic": "found", "ids": "given"}
     rules = [f"{one}/{name}:={two}/{name}" for name in ("image", "found") for one, two in (SIDES, SIDES[::-1])]
-    node = SegmentNode(
-        context=ros.context,
-        use_global_arguments=False,
-        cli_args=["--ros-args", *(text for rule in rules for text in ("-r", rule))],
-        parameter_overrides=[Parameter(n, value=v if isinstance(v, list) else str(v)) for n, v in values.items()],
-    )
-    try:
-        assert node.trigger_configure() == node.trigger_activate() == TransitionCallbackReturn.SUCCESS
-        assert node.inputs is not None
-        for images, detections, other in zip(node.inputs._images, node.inputs.detections, SIDES[::-1], strict=True):
+    with node_here(ros, values, rules) as here:
+        inputs = here.inputs
+        for images, detections, other in zip(inputs._images, inputs.detections, SIDES[::-1], strict=True):
             images._listen(True)
             assert images._subscription is not None
             heard = [images._subscription, detections._listen(PointCloud2, lambda topic, message: None)]
             assert [one._subscription.topic_name for one in heard] == [f"/{other}/image", f"/{other}/found"]
-    finally:
-        node.close()
+
+
+@pytest.mark.parametrize(("topic", "rectified"), [("/cam/image_rect/mask", True), ("/cam/image/mask", False)])
+def test_what_is_picked_in_is_rectified_where_the_topics_of_the_cameras_say_so(
+    ros: Ros, parameters: dict[str, Any], monkeypatch: pytest.MonkeyPatch, topic: str, rectified: bool
+) -> None:
+    found: list[bool] = []
+    monkeypatch.setattr(services, "pick_object", lambda *_, rectified: found.append(rectified))
+    with node_here(ros, {**parameters, "cameras": list(SIDES)}, [f"{side}/mask:={topic}" for side in SIDES]) as here:
+        here.ask("pick")
+    assert found == [rectified]
