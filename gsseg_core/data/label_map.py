@@ -59,7 +59,11 @@ def read_new_names(path: str | os.PathLike[str], within: Path | None = None) -> 
     if not isinstance(content, dict):
         raise LabelMapError(f"{path}: holds no object; expected {_EXPECTED}")
     named = {key: new for key, new in content.items() if type(key) in (str, int)}
-    given = {str(key): _new_name(new, f"{path}: gives {quoted(key)}") for key, new in named.items()}
+    who = f"{path}: gives"
+    given = {
+        str(key): None if new in (None, _IGNORE) else check_class_name(new, LabelMapError, f"{who} {quoted(key)}")
+        for key, new in named.items()
+    }
     if len(given) < len(content):
         raise LabelMapError(f"{path}: has keys that are neither names nor ids; expected {_EXPECTED}")
     return given
@@ -98,7 +102,3 @@ def map_labels(given: Mapping[str, str | None], class_names: Mapping[int, str], 
     if following > MAX_LABEL:
         raise LabelMapError(f"{source}: needs the id {following} for class 0; expected at most {MAX_LABEL}")
     return LabelMap(new_ids, dict(sorted(names.items())))
-
-
-def _new_name(value: object, who: str) -> str | None:
-    return None if value is None or value == _IGNORE else check_class_name(value, LabelMapError, who)

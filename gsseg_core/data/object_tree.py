@@ -173,16 +173,12 @@ class ObjectTree:
         Returns probabilities (n, K') float32 and the K' nodes of that level, ascending, so that classes come first.
         """
         table = self.cut(granularity)
-        nodes = np.unique(np.append(table[self._leaf_nodes], 0))
+        nodes = np.unique(np.append(table[np.setdiff1d(np.arange(len(self)), self.parents)], 0))
         column = np.zeros(len(self), np.uint32)
         column[nodes] = np.arange(len(nodes))
         usual, leaf = column[table[self._largest_leaf]], np.repeat(leaves, np.diff(shares.indptr))
         own = (leaf >= 0) & (self._classes[leaf] == shares.indices)
         return shares.in_columns(np.where(own, column[table[leaf]], usual[shares.indices])), nodes.tolist()
-
-    @cached_property
-    def _leaf_nodes(self) -> np.ndarray:
-        return np.setdiff1d(np.arange(len(self)), self.parents)
 
     def names(self, class_names: Mapping[int, str]) -> dict[int, str]:
         """Names of all nodes: those of classes, `object_003.2` for their parts, `whole_001` for wholes."""

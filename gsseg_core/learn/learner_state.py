@@ -40,7 +40,6 @@ from gsseg_core.files.npz_files import (
     temperature_of,
     write_arrays,
 )
-from gsseg_core.scene import living_files
 from gsseg_core.scene.camera import Camera
 from gsseg_core.scene.living_scene import LivingScene
 from gsseg_core.scene.scene_delta import MAX_ID
@@ -132,8 +131,8 @@ class State:
             if self.learnt.evidence is not None:
                 arrays["evidence"] = self.learnt.evidence
         if self.living is not None:
-            header["frames"] = living_files.frame_entries(self.living)
-            arrays |= living_files.arrays(self.living)
+            header["frames"] = self.living.frame_entries()
+            arrays |= self.living.arrays()
         if self.dropped:
             digests = b"".join(self.dropped[-_MOST_DROPPED:])
             arrays["dropped"] = np.frombuffer(digests, np.uint8).reshape(-1, DIGEST_BYTES)
@@ -169,7 +168,7 @@ class State:
         """
         path = Path(path)
         with open_npz(path, "a saved state", _FORMATS, None if first else digest, within) as (file, header):
-            living = living_files.read(file, header)
+            living = LivingScene.read(file, header)
             if first is not None and header.get("scene") == first.scene.digest:
                 living = living or first
             if first is not None and living is not None:
@@ -182,7 +181,7 @@ class State:
     def load_alone(cls, path: str | os.PathLike[str]) -> tuple[str, State]:
         """Read a state without its scene: the scene's digest, and the state; raises `StateFileError` as `load` does."""
         with open_npz(Path(path), "a saved state", _FORMATS, None) as (file, header):
-            living = living_files.read(file, header)
+            living = LivingScene.read(file, header)
             n = whole_number(header["shape"][0], "a side of the votes", 1, LIMITS.max_gaussians)
             if living is not None and len(living) != n:
                 raise UnfitError(f"claims votes of {n:,} Gaussians; expected {len(living):,}, as its scene has")

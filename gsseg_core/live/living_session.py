@@ -23,7 +23,6 @@ from gsseg_core.live.scene_change import SceneChange, carried
 from gsseg_core.live.session import LiveSession
 from gsseg_core.scene.camera import Camera
 from gsseg_core.scene.gaussian_scene import GaussianScene
-from gsseg_core.scene.living_files import without_colours
 from gsseg_core.scene.living_scene import LivingScene
 from gsseg_core.scene.scene_delta import SceneDelta
 
@@ -142,7 +141,7 @@ class LivingSession(LiveSession):
         self, before: LivingScene, after: LivingScene, origin: np.ndarray, joining: Mapping[str, int | None]
     ) -> Changed:
         change = SceneChange(before, after, origin)
-        first = without_colours(self._living) if self._first is self._living else self._first
+        first = self._living.without_colours() if self._first is self._living else self._first
         learnt = None if self._learnt is None else self._learnt.carried(change.carry)
         past = {scene: np.where(origin >= 0, places[origin], -1) for scene, places in self._past.items()}
         all_kept = self.num_fused == len(self._live.views)

@@ -16,7 +16,7 @@ from gsseg_core.scene.undistortion import Undistortion
 from gsseg_core.text import clipped
 
 # Poses come from text files of few digits; a deviation this small moves no point by a pixel.
-_RIGID_TOLERANCE = 1e-3
+RIGID_TOLERANCE = 1e-3
 
 
 @dataclass(frozen=True, eq=False)
@@ -169,7 +169,7 @@ class Camera:
         if abs(determinant) < 1e-9:
             return f"pose is not invertible (determinant {determinant:.3g}); expected a rigid motion"
         off = max(abs(rotation @ rotation.T - np.eye(3)).max(), abs(pose[3] - (0, 0, 0, 1)).max())
-        if determinant < 0 or off > _RIGID_TOLERANCE:
+        if determinant < 0 or off > RIGID_TOLERANCE:
             rigid = "a rotation of determinant 1, a translation, and 0 0 0 1 as the last row"
             return f"pose is not a rigid motion (determinant {determinant:.6g}, off by {off:.3g}); expected {rigid}"
         return ""

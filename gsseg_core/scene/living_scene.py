@@ -16,13 +16,18 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from gsseg_core.errors import EmptySceneError, SceneDeltaError
+from gsseg_core.errors import EmptySceneError, GssegError, SceneDeltaError
+from gsseg_core.files.input_files import UnfitError
+from gsseg_core.files.json_files import whole_number
+from gsseg_core.files.npz_files import NpzArrays
 from gsseg_core.scene.gaussian_scene import ACTIVATED, GaussianScene
 from gsseg_core.scene.group_frames import IDENTITY, is_identity, joined, moved_geometry, moved_scene, relation
-from gsseg_core.scene.scene_delta import SceneDelta
+from gsseg_core.scene.scene_delta import MAX_ID, SceneDelta, read_similarity, similarity_entry
 from gsseg_core.scene.scene_ids import with_ids
 from gsseg_core.scene.similarity import Similarity
+from gsseg_core.scene.vertices import MEANS, OPACITY, QUATS, SCALES, columns, pack_vertices
 
+_GEOMETRY = MEANS + OPACITY + SCALES + QUATS
 _FRAMES_KEPT = 2  # scenes in the frames of groups; views of one group come one after the other
 
 
@@ -76,6 +81,45 @@ class LivingScene:
     def numbered(cls, scene: GaussianScene, ids: npt.NDArray[np.int64]) -> LivingScene:  # (N,)
         """Begin with a scene, as `of`, with these ids."""
         return cls.of(replace(scene, vertices=with_ids(scene.vertices, None, ids)))
+
+    @classmethod
+    def read(cls, file: NpzArrays, header: dict[str, Any]) -> LivingScene | None:
+        """Read a scene, colourless, if the npz of a saved state holds one; `UnfitError` if what is there is none."""
+        if "geometry" not in file.names:
+            return None
+        geometry = file.expect("geometry", np.float32, (None, len(_GEOMETRY)))
+        ids, groups = (file.expect(name, np.int64, (len(geometry),)) for name in ("ids", "groups"))
+        if ids.min(initial=0) < 0 or len(np.unique(ids)) < len(ids):
+            raise UnfitError(
+                "array ids holds negative numbers, or some twice; expected another from 0 for each Gaussian"
+            )
+        try:
+            frames = {
+                whole_number(entry["group"], "group of a frame", 0, MAX_ID): read_similarity(entry)
+                for entry in header["frames"]
+            }
+            if not np.isin(groups, list(frames)).all():
+                raise UnfitError(
+                    f"array groups holds other groups than the {len(frames)} of its frames; expected those"
+                )
+            return cls.placed(_colourless(geometry), ids, groups, frames)
+        except GssegError as error:
+            raise UnfitError(
+                f"its scene is unusable ({error}); expected Gaussians, and a similarity per group"
+            ) from error
+
+    def arrays(self) -> dict[str, npt.NDArray[Any]]:
+        """Arrays that `read` takes, besides the frames: ids, groups, and geometry without colours."""
+        return {"ids": self.ids, "groups": self.groups, "geometry": columns(self.local.vertices, _GEOMETRY)}
+
+    def frame_entries(self) -> list[dict[str, Any]]:
+        """Frames of the groups, as `read` takes them, for a JSON header."""
+        return [{"group": group, **similarity_entry(frame)} for group, frame in self.frames.items()]
+
+    def without_colours(self) -> LivingScene:
+        """Drop the colours of the scene: its votes stay the same, bit for bit, and it takes a fifth of the memory."""
+        local = _colourless(columns(self.local.vertices, _GEOMETRY))
+        return LivingScene.placed(local, self.ids, self.groups, self.frames)
 
     def flat(self) -> LivingScene:
         """Make one group of the scene as it is now, whose frame is that of the scene; ids stay."""
@@ -209,3 +253,9 @@ class LivingScene:
             for name, array in arrays.items():
                 array[here] = getattr(part, name)
         return replace(scene, **arrays)
+
+
+def _colourless(geometry: npt.NDArray[np.float32]) -> GaussianScene:  # (N, 11)
+    means, logits, scales, quats = geometry[:, :3], geometry[:, 3], geometry[:, 4:7], geometry[:, 7:]
+    black = np.zeros((len(geometry), 3), np.float32)
+    return GaussianScene.from_vertices(pack_vertices(means, quats, scales, logits, black), None)

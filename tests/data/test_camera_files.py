@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import math
 from pathlib import Path
 
@@ -104,6 +105,13 @@ def test_poses_of_three_rows_and_lenses_without_distortion_are_accepted(tmp_path
     rows = transforms()["frames"][0]["transform_matrix"][:3]
     content = transforms(frame={"transform_matrix": rows}, camera_model="OPENCV", k1=0, k2=0.0, w=64.0)
     write_json(tmp_path / "transforms.json", content)
+    assert_lands(read_cameras(tmp_path)[0], 55, 35)
+
+
+def test_the_last_row_of_a_nerfstudio_pose_may_be_rounded(tmp_path: Path) -> None:
+    content = transforms()
+    content["frames"][0]["transform_matrix"][3] = [0.0, 0.0, 1e-17, 1.0000000000000002]
+    (tmp_path / "transforms.json").write_text(json.dumps(content))
     assert_lands(read_cameras(tmp_path)[0], 55, 35)
 
 

@@ -22,10 +22,10 @@ from gsseg_core.data.camera_formats.entries import Entry
 from gsseg_core.errors import CameraFileError, PoseError
 from gsseg_core.files.json_files import read_object
 from gsseg_core.files.limits import LIMITS
+from gsseg_core.scene.camera import RIGID_TOLERANCE
 from gsseg_core.scene.similarity import Similarity
 
 DATAPARSER = "dataparser_transforms.json"
-_RIGID_TOLERANCE = 1e-3
 _COLMAP_TRANSFORM = np.array([[0.0, 1, 0, 0], [1, 0, 0, 0], [0, 0, -1, 0], [0, 0, 0, 1]])
 """What nerfstudio takes for `applied_transform` where the field is missing and COLMAP's model lies beside the file."""
 
@@ -53,7 +53,7 @@ def _similarity(path: Path, matrix: npt.NDArray[np.float64], scale: float) -> Si
     """Make the similarity x -> scale * (matrix x), which scales the translation of the matrix, too."""
     left, _, right = np.linalg.svd(matrix[:3, :3])
     rotation = left @ right  # the nearest; files are of single precision
-    if np.abs(rotation - matrix[:3, :3]).max() > _RIGID_TOLERANCE or np.linalg.det(rotation) < 0:
+    if np.abs(rotation - matrix[:3, :3]).max() > RIGID_TOLERANCE or np.linalg.det(rotation) < 0:
         raise PoseError(f"{path}: 'transform' is no rigid motion after what was applied before it; expected one")
     return Similarity(scale, rotation, scale * matrix[:3, 3])
 

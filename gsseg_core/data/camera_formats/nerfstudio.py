@@ -10,7 +10,7 @@ import numpy as np
 from gsseg_core.data.camera_formats.entries import Entry, Intrinsics, cameras_of, entries, inverse_pose
 from gsseg_core.errors import CameraFileError, IntrinsicsError, PoseError
 from gsseg_core.files.json_files import read_object
-from gsseg_core.scene.camera import Camera
+from gsseg_core.scene.camera import RIGID_TOLERANCE, Camera
 from gsseg_core.scene.lens import LENS_MODELS, MODELS_BY_NAME, Projection
 from gsseg_core.text import clipped
 
@@ -27,7 +27,7 @@ def read_nerfstudio(path: Path, within: Path | None) -> list[Camera]:
         name, where = frame.stem("file_path"), frame.where
         entry = Entry(where, {**shared, **frame.fields})
         matrix = entry.array("transform_matrix", (4, 4), (3, 4))
-        if matrix.shape == (4, 4) and not np.array_equal(matrix[3], (0, 0, 0, 1)):
+        if matrix.shape == (4, 4) and not np.allclose(matrix[3], (0, 0, 0, 1), 0, RIGID_TOLERANCE):
             raise PoseError(f"{where}: the last row of the pose is {matrix[3].tolist()}; expected 0 0 0 1")
         pose = inverse_pose(matrix[:3, :3] * (1, -1, -1), matrix[:3, 3])
         cameras += cameras_of(where, name, _intrinsics(entry), pose)

@@ -67,8 +67,10 @@ class Polygons:
             found = f"a list of {len(value)}" if isinstance(value, list) else kind_of(value)
             raise MaskFormatError(f"{where}: has {found}; expected the points of a polygon, x and y of each")
         ring = ring.reshape(-1, 2)
-        if not (np.abs(ring) <= LIMITS.max_value).all():
-            raise MaskFormatError(f"{where}: a polygon has the point {_odd(ring)}; expected pixels of an image")
+        if len(odd := ring[~(np.abs(ring) <= LIMITS.max_value).all(axis=1)]):
+            raise MaskFormatError(
+                f"{where}: a polygon has the point ({odd[0, 0]:g}, {odd[0, 1]:g}); expected pixels of an image"
+            )
         return cls([ring], where)
 
     def parts(self, width: int, height: int) -> Iterator[Part]:
@@ -236,8 +238,3 @@ def scaled(labels: npt.NDArray[T], camera: Camera) -> npt.NDArray[T]:
         return labels
     rows, columns = (((np.arange(n) + 0.5) * m / n).astype(np.int64) for n, m in zip(size, labels.shape, strict=True))
     return labels[rows[:, None], columns]
-
-
-def _odd(ring: npt.NDArray[np.float64]) -> str:
-    x, y = ring[~(np.abs(ring) <= LIMITS.max_value).all(axis=1)][0]
-    return f"({x:g}, {y:g})"

@@ -100,7 +100,8 @@ def open_masks(path: Path, stems: Iterable[str], within: Path | None = None) -> 
             return None
         found = [known for known in MASK_FORMATS if known.recognise(place)]
         names = [known.name for known in found]
-        if found and "EISeg" not in names and _has_own(place):
+        own = mask_files(path, place.stems, within).values() if found and "EISeg" not in names else ()
+        if any(_is_own(file, place) for file in own):  # Photos beside annotations are none.
             names.append(LABEL_IMAGES)
         if len(names) > 1:
             raise MaskFormatError(
@@ -137,12 +138,8 @@ def _unknown(place: Place) -> Path | None:
     return None if mask_files(place.path, place.stems, place.within) else described
 
 
-def _has_own(place: Place) -> bool:
-    """Whether a folder has masks of gsseg's own kinds, too, and not only photos beside the annotations."""
-    return any(_is_own(path, place) for path in mask_files(place.path, place.stems, place.within).values())
-
-
 def _is_own(path: Path, place: Place) -> bool:
+    """Whether what has the name of a view is a mask of gsseg's own kinds."""
     if path.is_dir():
         files = list_folder(path, MaskFormatError, place.within)
         ids = [file.stem for file in files if file.suffix.lower() in DETECTIONS]
