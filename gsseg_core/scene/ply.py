@@ -5,6 +5,7 @@ from __future__ import annotations
 import io
 import os
 from collections.abc import Iterable
+from itertools import islice
 from pathlib import Path
 from typing import Any, BinaryIO
 
@@ -56,14 +57,19 @@ def read_elements(path: Path, within: Path | None = None) -> dict[str, npt.NDArr
 
 
 def _read_rows(element: Any, stream: Any, ply: Any) -> npt.NDArray[np.void]:
-    dtype = element.dtype(ply.byte_order)
-    if ply.text or dtype.hasobject:
+    dtype, count = element.dtype(ply.byte_order), element.count
+    if dtype.hasobject or not count * dtype.itemsize:
         element._read(stream, ply.text, ply.byte_order, False)
         rows: npt.NDArray[np.void] = element.data
+    elif ply.text:
+        # As plyfile reads it, number for number, and several times as fast.
+        rows = np.loadtxt(islice(stream, count), dtype, comments=None, ndmin=1)
+        if len(rows) < count:
+            raise ValueError(f"element {quoted(element.name)} ends after {len(rows):,} of {count:,} rows")
     else:
         # plyfile would map the file into memory: one that is written anew meanwhile would end the process.
-        rows = np.empty(element.count, dtype)
-        if rows.nbytes and (size := stream.readinto(rows.view(np.uint8))) < rows.nbytes:
+        rows = np.empty(count, dtype)
+        if (size := stream.readinto(rows.view(np.uint8))) < rows.nbytes:
             raise ValueError(f"element {quoted(element.name)} ends after {size:,} of {rows.nbytes:,} bytes")
     return rows.astype(dtype.newbyteorder("="), copy=False)
 

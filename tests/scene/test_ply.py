@@ -194,5 +194,15 @@ def test_too_little_memory_is_no_damage(tmp_path: Path, monkeypatch: pytest.Monk
         raise MemoryError("Unable to allocate 1.35 GiB")
 
     monkeypatch.setattr(np, "empty", exhausted)
+    monkeypatch.setattr(np, "loadtxt", exhausted)
     with pytest.raises(SceneFileError, match=r"scene\.ply: memory is not enough \(Unable to allocate 1\.35 GiB\)"):
         read_vertices(path)
+
+
+def test_a_line_too_few_or_an_empty_one_is_refused(tmp_path: Path) -> None:
+    path = write_ply(tmp_path / "scene.ply", some_vertices(), "ascii")
+    *lines, last = path.read_bytes().splitlines(keepends=True)
+    for content in ([*lines, b" " * 40], [*lines, b"\n", last]):
+        path.write_bytes(b"".join(content))
+        with pytest.raises(SceneFileError, match=r"element 'vertex' ends after 4 of 5 rows"):
+            read_vertices(path)
