@@ -173,7 +173,7 @@ def _photo(view: View, picture_px: int) -> Shown | None:
 
 
 def _mask(view: View, picture_px: int) -> Shown:
-    labels = view.read_labels()
+    labels = replace(view, class_names=None).read_labels()  # Names say nothing of outlines, nor of a view's own ids.
     window = _Window.of(view.camera, picture_px)
     outlines = np.zeros(labels.shape, np.float32)
     outlines[1:] = labels[1:] != labels[:-1]

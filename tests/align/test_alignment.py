@@ -25,6 +25,7 @@ from gsseg_core.align.registration import Located, fit_poses
 from gsseg_core.align.settings import AlignSettings
 from gsseg_core.cli.main import main
 from gsseg_core.data.dataset import Dataset
+from gsseg_core.data.label_images import write_mask
 from gsseg_core.data.view import View, spread
 from gsseg_core.errors import AlignmentError
 from gsseg_core.export.view_pictures import background_image
@@ -100,6 +101,18 @@ def test_cameras_that_fit_are_said_to_fit_by_masks_and_by_photos(
     for folder, compared in ((demo, "masks"), (with_photos, "photos")):
         found = place(scene, Dataset(folder), check=True).agreement
         assert found is not None and found.agrees and found.compared == compared
+
+
+def test_masks_whose_ids_classes_json_does_not_name_tell_as_well_where_cameras_are(
+    demo: Path, scene: GaussianScene, tmp_path: Path
+) -> None:
+    for name in ("cameras.json", "classes.json", "split.json"):
+        shutil.copy(demo / name, tmp_path)
+    for view in Dataset(demo).views("train"):
+        labels = view.read_labels()
+        write_mask(tmp_path / f"own/{view.name}.png", np.where(labels > 0, labels + 100, labels), 8)
+    own, named = (place(scene, Dataset(*of), check=True).agreement for of in ((tmp_path, "own"), (demo,)))
+    assert own is not None and own == named
 
 
 @pytest.mark.parametrize("folder", ["demo", "with_photos"])
