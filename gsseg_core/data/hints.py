@@ -50,7 +50,7 @@ def camera_hint(folder: Path) -> str:
     for below, known in product(_folders(folder), CAMERA_FORMATS):
         with suppress(GssegError):
             if found := known.find_in(below):
-                # Masks are here and cameras below, as ns-process-data leaves them: the cameras have to come up.
+                # ns-process-data writes cameras into a sub-folder, and masks lie here: a link puts the two together.
                 place = folder / (known.folders[-1] if known.folders else found.name)
                 return f"; found cameras in {found}: type ln -s {_quoted(found.resolve())} {_quoted(place)}"
     for name, advice in _FOREIGN_CAMERAS.items():

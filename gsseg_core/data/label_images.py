@@ -38,6 +38,20 @@ IDS = (GLOBAL, PER_VIEW)
 _PNG_KINDS = {0: "gray", 2: "RGB", 3: "palette", 4: "gray + alpha", 6: "RGBA"}
 
 
+class PngHeader(NamedTuple):
+    """What the header of a PNG says: gray, RGB, palette, gray + alpha or RGBA; bits per channel; size in pixels."""
+
+    kind: str
+    depth: int
+    width: int
+    height: int
+
+    @property
+    def bits(self) -> int:
+        """Bits per label, 8 or 16, if it is a label image."""
+        return 8 if self.kind == "palette" else self.depth
+
+
 class Mask(NamedTuple):
     """A label image and how many bits a pixel had in its file."""
 
@@ -67,15 +81,7 @@ def read_mask(
     return Mask(labels, header.bits)
 
 
-class MaskHeader(NamedTuple):
-    """What the header of a label image says: bits per label, 8 or 16, and its size in pixels."""
-
-    bits: int
-    width: int
-    height: int
-
-
-def mask_header(path: str | os.PathLike[str], within: Path | None = None) -> MaskHeader:
+def mask_header(path: str | os.PathLike[str], within: Path | None = None) -> PngHeader:
     """Read the header of a label image; raises as `read_mask` does."""
     with _open_mask(path, within) as file:
         return _read_header(file, str(path))
@@ -91,8 +97,9 @@ def _open_mask(path: str | os.PathLike[str], within: Path | None) -> Iterator[Bu
         raise MaskFormatError(f"{path}: cannot be read ({reason(error)}); expected a label image") from error
 
 
-def _read_header(file: BufferedReader, source: str) -> MaskHeader:
-    kind, depth, width, height = png_header(file.read(26), source)
+def _read_header(file: BufferedReader, source: str) -> PngHeader:
+    header = png_header(file.read(26), source)
+    kind, depth, width, height = header
     if kind != "palette" and (kind != "gray" or depth not in (8, 16)):
         colours = "of ids drawn in colours save the ids themselves (a palette made for each image numbers them anew)"
         fix = f"; a photo is no mask, and {colours}" if "RGB" in kind else ""
@@ -101,16 +108,7 @@ def _read_header(file: BufferedReader, source: str) -> MaskHeader:
         )
     check_pixels(width, height, source, MaskFormatError)
     file.seek(0)
-    return MaskHeader(8 if kind == "palette" else depth, width, height)
-
-
-class PngHeader(NamedTuple):
-    """What the header of a PNG says: gray, RGB, palette, gray + alpha or RGBA; bits per channel; size in pixels."""
-
-    kind: str
-    depth: int
-    width: int
-    height: int
+    return header
 
 
 def png_header(start: bytes, source: str) -> PngHeader:

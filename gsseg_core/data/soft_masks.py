@@ -48,7 +48,7 @@ class SeenLabels(NamedTuple):
 
     @property
     def concerned(self) -> npt.NDArray[np.int32]:
-        """Classes on which the mask has evidence, any number of times, and `UNKNOWN` maybe."""
+        """Classes on which the mask has evidence: in any shape, with repetitions, and perhaps with `UNKNOWN`."""
         return self.labels if self.evidence is None else self.evidence.concerned
 
     def named(self) -> npt.NDArray[np.int32]:

@@ -11,7 +11,6 @@ from typing import IO, Any, NamedTuple
 import numpy as np
 
 SPARED = 1 << 30  # bytes of the disk that are left to others
-_ALIGNED = 64  # bytes, as arrays in memory begin
 
 
 class _Place(NamedTuple):
@@ -23,7 +22,7 @@ class _Place(NamedTuple):
 
     @property
     def size(self) -> int:
-        return sum(map(_padded, self.sizes))
+        return sum(self.sizes)
 
 
 class ScratchFile:
@@ -39,7 +38,7 @@ class ScratchFile:
         self._holes: list[tuple[int, int]] = []  # offset and size of what was dropped
 
     def __reduce__(self) -> tuple[type[ScratchFile], tuple[()]]:
-        """Have a copy begin empty."""
+        """Copy and pickle as an empty file."""
         return ScratchFile, ()
 
     def __del__(self) -> None:
@@ -69,7 +68,7 @@ class ScratchFile:
             offset = place.offset
             for array in arrays:
                 _write(self._file.fileno(), array, offset)
-                offset += _padded(array.nbytes)
+                offset += array.nbytes
         except OSError:
             return False
         self._places[name] = place
@@ -85,7 +84,7 @@ class ScratchFile:
         try:
             for array in arrays:
                 _read(self._file.fileno(), array.data, offset)
-                offset += _padded(array.nbytes)
+                offset += array.nbytes
         except OSError:
             return None
         return pickle.loads(place.rest, buffers=arrays)
@@ -116,17 +115,13 @@ class ScratchFile:
         descriptor = self._file.fileno()
         if shutil.disk_usage(descriptor).free < size + SPARED:
             raise OSError("no space left for scratch")
-        return _padded(os.fstat(descriptor).st_size)
+        return os.fstat(descriptor).st_size
 
 
 def _folder() -> str | None:
     """Find where the file goes; None leaves it to Python."""
     asked = os.environ.get("TMPDIR", "")
     return next((path for path in (asked, "/var/tmp") if os.path.isdir(path) and os.access(path, os.W_OK)), None)
-
-
-def _padded(size: int) -> int:
-    return -(-size // _ALIGNED) * _ALIGNED
 
 
 def _write(descriptor: int, data: memoryview, offset: int) -> None:

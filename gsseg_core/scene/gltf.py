@@ -70,7 +70,7 @@ def _chunks(content: bytes) -> tuple[bytes, bytes | None]:
 
 
 class _Reader:
-    """Reader of the splats of one document; what is missing there or of another type is an error of Python's own."""
+    """Reader of the splats of one document: what it lacks raises Python's own errors, which `open_scene` takes."""
 
     def __init__(self, document: Any, binary: bytes | None, path: Path, within: Path | None) -> None:
         self._document, self._binary, self._path, self._within = document, binary, path, within

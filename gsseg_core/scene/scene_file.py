@@ -16,10 +16,11 @@ from gsseg_core.text import clipped
 
 @contextmanager
 def open_scene(path: Path, within: Path | None, expected: str) -> Iterator[BufferedReader]:
-    """Open a file that should be `expected`, such as "an SPZ file"; damage that shows in the body is its damage.
+    """Open a file that should be `expected`, such as "an SPZ file"; what the body raises counts as damage to the file.
 
-    Raises `SceneFileError` where the file is missing, damaged, or the body raised `UnfitError`, whose message says what
-    was found and expected; `PathNotAllowedError` where it does not lie below `within`, links followed.
+    Raises `SceneFileError` where the file is missing, damaged, too large for the memory, or the body raised
+    `UnfitError`, whose message says what was found and expected; `PathNotAllowedError` where it does not lie below
+    `within`, links followed.
     """
     try:
         file = open_input(path, within)
