@@ -231,8 +231,8 @@ class View:
 
     @property
     def mask_bits(self) -> int | None:
-        """Bits per label of a label image, 8 or 16 (of other masks: as many as labels need); None without a mask."""
-        if self.mask_path is not None and self.mask_path.suffix.lower() == ".png":
+        """Bits per label of a label image in a file, 8 or 16; of other masks, as many as labels need; None without."""
+        if not self.is_in_memory and self.mask_path is not None and self.mask_path.suffix.lower() == ".png":
             return mask_header(self.mask_path, self.within).bits
         return (8 if self.largest_label < 255 else 16) if self.has_mask else None
 

@@ -181,7 +181,7 @@ class Lens:
     def _flaw(self) -> str:
         """Say what is wrong with the numbers, or "" if the lens can be undone."""
         if not np.isfinite([*self.focal, *self.principal, *self.coefficients]).all():
-            return f"focal lengths are {self.focal}, the principal point {self.principal}; expected finite numbers"
+            return f"focal lengths {self.focal}, principal point {self.principal}; expected finite numbers everywhere"
         if min(self.focal) <= 0:
             return f"focal lengths are {self.focal[0]:g} and {self.focal[1]:g}; expected positive pixels"
         size = np.array([self.width, self.height])

@@ -65,6 +65,13 @@ def test_a_view_in_memory_has_the_bits_that_its_labels_need() -> None:
         assert View.from_arrays(camera(), np.full((HEIGHT, WIDTH), label)).mask_bits == bits
 
 
+def test_a_mask_that_is_held_needs_its_file_no_more(tmp_path: Path) -> None:
+    view = Dataset(make_dataset(tmp_path)).views()[0].held()
+    (tmp_path / "labels" / "a.png").unlink()
+    np.testing.assert_array_equal(view.read_labels(), LABELS)
+    assert view.mask_bits == 8
+
+
 def test_labels_in_memory_are_checked_at_once() -> None:
     with pytest.raises(MaskSizeError, match=r"view 'a': mask is 4 x 6 pixels; expected 6 x 4, the size of camera 'a'"):
         View.from_arrays(camera(), LABELS.T)

@@ -229,11 +229,12 @@ def test_labelme_draws_rectangles_and_circles_and_knows_background_and_what_to_i
         {"label": "__ignore__", "points": boxes(3)[0]},
         {"label": "_background_", "points": boxes(1)[0]},
     ]
-    labels = one_view(
-        tmp_path, "frame_001.json", {"shapes": shapes, "imagePath": "", "imageWidth": WIDTH, "imageHeight": HEIGHT}
-    )
+    whole = {"shapes": shapes, "imagePath": "", "imageWidth": WIDTH, "imageHeight": HEIGHT}
+    labels = one_view(tmp_path, "frame_001.json", whole)
     assert (labels == UNKNOWN).sum() == 8 and labels[0, 0] == 0 and (labels == 2).sum() == 35
     assert (labels == 1).sum() == pytest.approx(np.pi * 16, rel=0.1) and (labels == 3).sum() == pytest.approx(8, abs=4)
+    shapes[2]["shape_type"] = "rotation"  # as X-AnyLabeling has it
+    np.testing.assert_array_equal(one_view(tmp_path, "frame_001.json", whole), labels)
 
 
 def test_yolo_without_names_numbers_its_classes(tmp_path: Path) -> None:

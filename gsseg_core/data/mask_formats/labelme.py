@@ -47,7 +47,7 @@ def _region(shape: Record) -> Region:
     kind = shape.fields.get("shape_type") or "polygon"
     outline = Polygons.of(shape.value("points"), shape.where)
     points = outline.rings[0]
-    if kind in ("polygon", "oriented_rectangle"):
+    if kind in ("polygon", "oriented_rectangle", "rotation"):  # the last one is X-AnyLabeling's
         return outline
     if kind not in _KINDS:
         raise MaskFormatError(
