@@ -29,7 +29,7 @@ _LONG_S = 1.0  # Whoever has waited for longer is looked at by `expire` alone, u
 _LONGEST_STEP_S = 0.5
 
 MOST_BYTES = 256 << 20
-"""Of masks of a camera that wait."""
+"""Of masks of a camera that wait for what belongs to them."""
 
 
 class Paired(NamedTuple):

@@ -17,7 +17,7 @@ from sensor_msgs.msg import Image
 from gsseg_core.errors import MaskFormatError, UnknownLabelError
 from gsseg_ros.conversions import stamp_message
 from gsseg_ros.errors import TooManyPixelsError
-from gsseg_ros.node.masks import vision_detections, yolo_detections
+from gsseg_ros.node.masks import detections_input, vision_detections, yolo_detections
 from gsseg_ros.node.masks.detections import ADAPTERS, MOST_DETECTIONS, Beside, Detected
 from gsseg_ros.node.masks.detections_input import DetectionsInput
 
@@ -208,6 +208,19 @@ def test_what_stays_alone_is_lost_after_thirty_more(monkeypatch: pytest.MonkeyPa
         joined.input.add(TOPIC, joined.stamped(100 + second))
     assert [reason for reason, _ in joined.lost] == ["no_detections", "no_mask"]
     assert joined.lost[0][1].startswith("/mask: no detections with its stamp came on /some/topic; expected")
+
+
+def test_masks_that_wait_for_detections_take_no_more_memory_than_others(monkeypatch: pytest.MonkeyPatch) -> None:
+    joined = Joined(Graph("vision_msgs/msg/Detection2DArray"), monkeypatch)
+    joined.input.look()
+    monkeypatch.setattr(detections_input, "MOST_BYTES", 100)
+    for second, size in enumerate((40, 40, 40, 200)):
+        mask = joined.stamped(second)
+        mask.data = bytes(size)
+        joined.input.add_mask("/mask", mask)
+        assert [reason for reason, _ in joined.lost] == ["no_detections"] * (0, 0, 1, 3)[second]
+    joined.input.add(TOPIC, joined.stamped(3))
+    assert len(joined.forwarded) == 1
 
 
 def waiting(monkeypatch: pytest.MonkeyPatch) -> Joined:

@@ -10,6 +10,7 @@ from rclpy.node import Node
 
 from gsseg_ros.conversions import stamp_ns
 from gsseg_ros.node.masks.detections import ADAPTERS, Adapter, Detected
+from gsseg_ros.node.pairing import MOST_BYTES
 
 Take: TypeAlias = Callable[[str, Any], None]
 """A function that takes in the name of a topic and a message."""
@@ -99,9 +100,12 @@ class DetectionsInput:
             message, mask = self._messages.pop(stamp), self._masks.pop(stamp)
             self._forward(self._topic, Detected(message.header, self.adapter, message, mask))
         expected = "expected detections and mask to carry the stamp of the same image"
-        if len(self._masks) > _WAITING:
+        while len(self._masks) > _WAITING or (len(self._masks) > 1 and self._mask_bytes() > MOST_BYTES):
             topic, _ = self._masks.pop(next(iter(self._masks)))
             self._lost("no_detections", f"{topic}: no detections with its stamp came on {self._topic}; {expected}")
         if len(self._messages) > _WAITING:
             self._messages.pop(next(iter(self._messages)))
             self._lost("no_mask", f"{self._topic}: no mask with their stamp came; {expected}")
+
+    def _mask_bytes(self) -> int:
+        return sum(len(mask.data) for _, mask in self._masks.values())
