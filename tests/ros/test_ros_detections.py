@@ -154,8 +154,8 @@ class Joined:
             lambda reason, message: self.lost.append((reason, message)),
         )  # fmt: skip
 
-    def stamped(self, second: int) -> Any:
-        return Image(header=type(HEADER)(stamp=stamp_message(second * 10**9)))
+    def stamped(self, second: int, frame: str = "") -> Any:
+        return Image(header=type(HEADER)(stamp=stamp_message(second * 10**9), frame_id=frame))
 
 
 def test_the_type_of_detections_is_found_once_somebody_publishes_them(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -198,6 +198,24 @@ def test_detections_and_masks_of_one_stamp_are_joined_in_any_order(monkeypatch: 
     assert [found.mask for _, found in joined.forwarded] == [("/mask", joined.stamped(2)), ("/mask", joined.stamped(1))]
     joined.input.close()
     assert graph.gone == ["Detection2DArray subscription", "mask subscription"]
+
+
+def test_detections_of_one_stamp_are_joined_with_the_mask_of_their_camera(monkeypatch: pytest.MonkeyPatch) -> None:
+    joined = Joined(Graph("vision_msgs/msg/Detection2DArray"), monkeypatch)
+    joined.input.look()
+    joined.input.add_mask("/mask", joined.stamped(1, "optical"))
+    joined.input.add(TOPIC, joined.stamped(1, "camera"))  # Of the only camera, whatever they call it.
+    assert len(joined.forwarded) == 1
+    for second, order in ((2, ("left", "right")), (3, ("right", "left"))):
+        for frame in ("left", "right"):
+            joined.input.add_mask("/mask", joined.stamped(second, frame))
+        for frame in order:
+            joined.input.add(TOPIC, joined.stamped(second, frame))
+    found = [(found.header, found.mask and found.mask[1].header) for _, found in joined.forwarded[1:]]
+    assert len(found) == 4 and all(one == other for one, other in found)
+    joined.input.add(TOPIC, joined.stamped(4, ""))
+    joined.input.add_mask("/mask", joined.stamped(4, "left"))
+    assert len(joined.forwarded) == 6 and not joined.lost
 
 
 def test_what_stays_alone_is_lost_after_thirty_more(monkeypatch: pytest.MonkeyPatch) -> None:

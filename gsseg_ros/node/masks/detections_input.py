@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import threading
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from typing import Any, TypeAlias
 
 from rclpy.node import Node
@@ -14,6 +14,8 @@ from gsseg_ros.node.pairing import MOST_BYTES
 
 Take: TypeAlias = Callable[[str, Any], None]
 """A function that takes in the name of a topic and a message."""
+
+_Key: TypeAlias = tuple[int, str]  # stamp and frame_id
 
 _WAITING = 30  # Masks, and detections, that wait for each other.
 
@@ -39,8 +41,9 @@ class DetectionsInput:
         self.adapter: Adapter | None = None
         self._lock, self._closed = threading.Lock(), False
         self._subscriptions: list[Any] = []
-        self._messages: dict[int, Any] = {}
-        self._masks: dict[int, tuple[str, Any]] = {}
+        self._messages: dict[_Key, Any] = {}
+        self._masks: dict[_Key, tuple[str, Any]] = {}
+        self._frames: set[str] = set()  # of the masks, two at most
 
     def clear(self) -> int:
         """Forget the masks, and the detections, that wait for each other; return how many they were."""
@@ -86,18 +89,28 @@ class DetectionsInput:
             self._forward(topic, Detected(message.header, self.adapter, message))
             return
         with self._lock:
-            self._messages[stamp_ns(message.header.stamp)] = message
-            self._join(stamp_ns(message.header.stamp))
+            key = stamp_ns(message.header.stamp), message.header.frame_id
+            self._messages[key] = message
+            self._join(self._partner(key, self._masks), key)
 
     def add_mask(self, topic: str, message: Any) -> None:
         """Take in a mask that belongs to detections of its stamp."""
         with self._lock:
-            self._masks[stamp_ns(message.header.stamp)] = (topic, message)
-            self._join(stamp_ns(message.header.stamp))
+            key = stamp_ns(message.header.stamp), message.header.frame_id
+            self._masks[key] = (topic, message)
+            if len(self._frames) < 2:
+                self._frames.add(key[1])
+            self._join(key, self._partner(key, self._messages))
 
-    def _join(self, stamp: int) -> None:
-        if self.adapter is not None and stamp in self._messages and stamp in self._masks:
-            message, mask = self._messages.pop(stamp), self._masks.pop(stamp)
+    def _partner(self, key: _Key, others: Iterable[_Key]) -> _Key:
+        """Find what is of the same stamp and camera; of which camera, need not be said where all masks are of one."""
+        same = [other for other in others if other[0] == key[0]]
+        alike = [o for o in same if len(self._frames) < 2 or "" in (o[1], key[1])]
+        return key if key in same else next(iter(alike), key)
+
+    def _join(self, mask_key: _Key, key: _Key) -> None:
+        if self.adapter is not None and key in self._messages and mask_key in self._masks:
+            message, mask = self._messages.pop(key), self._masks.pop(mask_key)
             self._forward(self._topic, Detected(message.header, self.adapter, message, mask))
         expected = "expected detections and mask to carry the stamp of the same image"
         while len(self._masks) > _WAITING or (len(self._masks) > 1 and self._mask_bytes() > MOST_BYTES):
