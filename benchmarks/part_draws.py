@@ -31,7 +31,6 @@ from skimage.morphology import dilation, disk, erosion
 
 from gsseg_core.data.dataset import Dataset
 from gsseg_core.data.label_images import UNKNOWN
-from gsseg_core.data.photos import read_photo
 from gsseg_core.data.view import View
 from gsseg_core.objects.association import AssociationSettings, associate
 from gsseg_core.objects.lifted_segments import Lifted
@@ -151,7 +150,7 @@ class Trial:
 
 
 def _photo(view: View) -> np.ndarray:
-    photo = read_photo(view)
+    photo = view.read_photo()
     assert photo is not None
     return photo
 

@@ -23,7 +23,6 @@ from PIL import Image
 
 from gsseg_core.align.settings import AlignSettings
 from gsseg_core.data.label_images import UNKNOWN
-from gsseg_core.data.photos import read_photo
 from gsseg_core.data.view import View, spread
 from gsseg_core.errors import GssegError
 from gsseg_core.raster.backends import make_operator
@@ -164,7 +163,7 @@ def render(scene: GaussianScene, camera: Camera, device: str = "cpu") -> Rendere
 
 
 def _photo(view: View, picture_px: int) -> Shown | None:
-    photo = read_photo(view)
+    photo = view.read_photo()
     if photo is None:
         return None
     window = _Window.of(view.camera, picture_px)

@@ -15,7 +15,6 @@ from PIL import Image
 
 from gsseg_core.align.agreement import LUMINANCE
 from gsseg_core.align.settings import AlignSettings
-from gsseg_core.data.photos import read_photo
 from gsseg_core.data.view import View, spread
 from gsseg_core.errors import AlignmentError
 from gsseg_core.raster.backends import make_operator
@@ -80,7 +79,7 @@ class PhotosInScene:
         """Read some photos, spread evenly over those that there are, with their features."""
         photos, extractor = [], Extractor(settings)
         for view in spread([view for view in views if view.image_path is not None], settings.photos):
-            taken = read_photo(view)
+            taken = view.read_photo()
             if taken is not None:
                 camera = _shrunk(view.camera, settings.photo_px)
                 grey = Image.fromarray(taken).convert("L").resize((camera.width, camera.height), Image.Resampling.BOX)

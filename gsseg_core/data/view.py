@@ -19,6 +19,7 @@ from gsseg_core.data.mask_formats.images import read_label_image
 from gsseg_core.data.mask_formats.masks import ViewMask
 from gsseg_core.data.soft_masks import PackedMask, SeenLabels, combine_detections, quantise, restrict
 from gsseg_core.errors import GssegError, MaskFormatError, SettingsError, UnknownLabelError
+from gsseg_core.files.input_files import open_image
 from gsseg_core.files.limits import MAX_LABEL
 from gsseg_core.files.npz_files import Header
 from gsseg_core.scene.camera import Camera, smaller_camera
@@ -291,6 +292,19 @@ class View:
             seen = seen.relabelled(self.label_map.new_ids, source)
         self._check_seen(seen, source)
         return seen
+
+    def read_photo(self) -> npt.NDArray[np.uint8] | None:
+        """Read the photo, (H, W, 3) RGB, undistorted; None if there is none, it is broken or of another size."""
+        if self.image_path is None:
+            return None
+        try:
+            with open_image(self.image_path, MaskFormatError, "image", "a photo", within=self.within) as photo:
+                if photo.size != self.camera.image_size:
+                    return None
+                taken, undistortion = np.asarray(photo.convert("RGB")), self.camera.undistortion
+                return taken if undistortion is None else undistortion.photo(taken)
+        except (MaskFormatError, MemoryError):  # What is only looked at is not worth an error.
+            return None
 
     def _read_file(self) -> SeenLabels:
         """Read a mask from its file, in the size of the image as it was taken."""

@@ -11,7 +11,6 @@ import numpy as np
 from PIL import Image
 
 from gsseg_core.data.label_images import UNKNOWN
-from gsseg_core.data.photos import read_photo
 from gsseg_core.data.view import View
 from gsseg_core.export.pictures import FAINT_INK, outline, overlay, shown_at, shrunk
 from gsseg_core.export.view_pictures import Drawn, background_image
@@ -58,7 +57,7 @@ class ViewImages:
 
     def of(self, view: View) -> np.ndarray:
         """Give the image, (H, W, 3) uint8 of the camera's size."""
-        photo = read_photo(view)
+        photo = view.read_photo()
         return self.rendered(view) if photo is None else photo
 
     def rendered(self, view: View) -> np.ndarray:

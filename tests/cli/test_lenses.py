@@ -87,10 +87,9 @@ def test_an_object_is_picked_by_a_mask_drawn_on_the_bent_photo(
 
 
 def test_the_report_shows_photos_without_the_distortion(place: Path) -> None:
-    from gsseg_core.data.photos import read_photo
 
     for view in Dataset(place / "data").views():
-        photo = read_photo(view)
+        photo = view.read_photo()
         assert photo is not None and photo.shape == (view.camera.height, view.camera.width, 3)
         near = np.abs(photo[..., 0].astype(int) - 60 * np.maximum(view.read_labels(), 0)) < 30
         assert near.mean() > 0.9

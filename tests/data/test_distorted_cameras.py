@@ -14,7 +14,6 @@ from PIL import Image
 
 from gsseg_core.data.dataset import Dataset
 from gsseg_core.data.label_images import UNKNOWN, write_mask
-from gsseg_core.data.photos import read_photo
 from gsseg_core.errors import IntrinsicsError, MaskSizeError
 from gsseg_core.scene.lens import MODELS_BY_NAME
 
@@ -35,7 +34,7 @@ def write_image_of_point(root: Path, name: str) -> None:
 def assert_point_is_seen(root: Path) -> None:
     seen = 0
     for view in Dataset(root).views("train"):
-        labels, photo = view.read_labels(), read_photo(view)
+        labels, photo = view.read_labels(), view.read_photo()
         assert photo is not None and photo.shape == (*labels.shape, 3)
         uv, depth = view.camera.project([POINT])
         if depth[0] > 0 and ((uv >= 0) & (uv < (view.camera.width, view.camera.height))).all():
