@@ -46,20 +46,20 @@ def read_gltf(path: Path, within: Path | None = None) -> ReadScene:
     """Read all splats of a glTF scene into the axes of a PLY, node after node, each moved as its node says."""
     with open_scene(path, within, _EXPECTED) as file:
         content = file.read()
-        document, binary = _chunks(content) if content.startswith(b"glTF") else (content, None)
+        document, binary = _chunks(memoryview(content)) if content.startswith(b"glTF") else (content, None)
         if len(document) > LIMITS.max_json_bytes:
             raise UnfitError(f"has {len(document):,} bytes of JSON; expected at most {LIMITS.max_json_bytes:,}")
-        return _Reader(json.loads(document), binary, path, within).read()
+        return _Reader(json.loads(bytes(document)), binary, path, within).read()
 
 
-def _chunks(content: bytes) -> tuple[bytes, bytes | None]:
-    """Split a GLB into its JSON and its binary chunk."""
+def _chunks(content: memoryview) -> tuple[memoryview, memoryview | None]:
+    """Split a GLB into its JSON and its binary chunk, without copies."""
     check_size(len(content), 20, "header")
     _, version, length = struct.unpack_from("<4sII", content)
     if version != 2:
         raise UnfitError(f"is GLB of version {version}; expected 2")
     check_size(len(content), length, "file")
-    chunks: dict[int, bytes] = {}
+    chunks: dict[int, memoryview] = {}
     place = 12
     while place + 8 <= length:
         size, kind = struct.unpack_from("<II", content, place)
@@ -72,9 +72,9 @@ def _chunks(content: bytes) -> tuple[bytes, bytes | None]:
 class _Reader:
     """Reader of the splats of one document: what it lacks raises Python's own errors, which `open_scene` takes."""
 
-    def __init__(self, document: Any, binary: bytes | None, path: Path, within: Path | None) -> None:
+    def __init__(self, document: Any, binary: memoryview | None, path: Path, within: Path | None) -> None:
         self._document, self._binary, self._path, self._within = document, binary, path, within
-        self._buffers: dict[int, bytes] = {}
+        self._buffers: dict[int, memoryview] = {}
         self._count = 0
 
     def read(self) -> ReadScene:
@@ -162,7 +162,7 @@ class _Reader:
             values = np.maximum(values / np.iinfo(dtype).max, -1)
         return values
 
-    def _view(self, index: int) -> bytes:
+    def _view(self, index: int) -> memoryview:
         view = self._document["bufferViews"][index]
         content = self._buffer(view["buffer"])
         start, size = view.get("byteOffset", 0), view["byteLength"]
@@ -171,13 +171,13 @@ class _Reader:
         check_size(len(content), start + size, "buffer")
         return content[start : start + size]
 
-    def _buffer(self, index: int) -> bytes:
+    def _buffer(self, index: int) -> memoryview:
         if index not in self._buffers:
             buffer = self._document["buffers"][index]
-            self._buffers[index] = self._load(buffer.get("uri"), index, buffer["byteLength"])
+            self._buffers[index] = memoryview(self._load(buffer.get("uri"), index, buffer["byteLength"]))
         return self._buffers[index]
 
-    def _load(self, uri: str | None, index: int, size: int) -> bytes:
+    def _load(self, uri: str | None, index: int, size: int) -> bytes | memoryview:
         if uri is None:
             if index or self._binary is None:
                 raise UnfitError(f"has no bytes for buffer {index}; expected the binary chunk of a GLB, or a uri")
