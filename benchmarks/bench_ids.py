@@ -1,6 +1,6 @@
 """Masks whose ids hold only inside their own view: how well objects are found, on the real scene and the demo's.
 
-Usage: python benchmarks/bench_ids.py [--data FOLDER] [--out results_out/ids.md] [--scene replica|demo|parts]
+Usage: python benchmarks/bench_ids.py [--data FOLDER] [--out results_out/ids.md] [--scene replica|demo|parts|tracks]
 
 Every row finds the objects of the train views, learns them with `em`, and scores label maps of the test views against
 true ids that it never saw: ARI, mIoU under the best one-to-one matching, and mIoU where each found object takes the
@@ -12,6 +12,9 @@ the truth alone: pixels of an id, placed in space by the rendered depth, are one
 "Parts" are the scenes that have `labels_parts/`: masks as automatic generators make them, objects split into up to four
 parts in every view anew, neighbours merged, masks missing. There the background has ids, too, and is left out; only the
 expected calibration error (ECE) counts it, all of it as one object.
+
+"Tracks" are the same scenes with masks of whole objects, true and wrong, under the ids of a tracker that goes through
+the views in order: what was out of sight comes back under a new id, and so does what was lost by chance.
 """
 
 from __future__ import annotations
@@ -22,6 +25,7 @@ import tempfile
 import time
 from collections.abc import Callable
 from dataclasses import replace
+from itertools import product
 from pathlib import Path
 from typing import NamedTuple
 
@@ -58,6 +62,9 @@ SHOWN = 200
 CELL, REACH, LEAST = 0.1, 0.31, 300
 """Instances: size of a cell and the gap between cells that hang together, in scene units, and fewest pixels of one."""
 
+LOST = (0.0, 0.05, 0.2)
+"""Tracks: probability that an object is lost from one view to the next, besides where it is out of sight."""
+
 COLUMNS = ["masks", "ids", "objects", "true", "ARI", "mIoU one-to-one", "mIoU many-to-one", "find, s", "learn, s"]
 
 
@@ -77,12 +84,14 @@ def main() -> int:
     repository = Path(__file__).resolve().parents[1]
     parser.add_argument("--data", default=os.environ.get("GSSEG_DATA") or repository.parent / "shared/data", type=Path)
     parser.add_argument("--out", default=repository / "results_out/ids.md", type=Path)
-    parser.add_argument("--scene", choices=("replica", "demo", "parts"))
+    parser.add_argument("--scene", choices=("replica", "demo", "parts", "tracks"))
     options = parser.parse_args()
     warm_up()
     sections = []
     if options.scene in (None, "parts"):
         sections.append("## Parts and wholes\n\n" + parts(options.data))
+    if options.scene in (None, "tracks"):
+        sections.append("## Tracks that break\n\n" + tracks(options.data))
     if options.scene in (None, "demo"):
         with tempfile.TemporaryDirectory() as folder:
             sections.append("## Demo scene\n\n" + demo(Path(folder)))
@@ -136,6 +145,41 @@ def parts(data: Path) -> str:
         ])  # fmt: skip
         print(*lines[-1], sep=", ", flush=True)
     return markdown(["scene", "objects", "found", "IoU one-to-one", "least", "ECE", "find, s", "learn, s"], lines)
+
+
+def tracks(data: Path) -> str:
+    """Measure on masks of whole objects under the ids of a tracker: as classes, and with objects found in them."""
+    lines = []
+    for folder in sorted(path.parent for path in data.glob("*/labels_parts")):
+        scene, tests = GaussianScene.load(folder / "scene.ply"), Dataset(folder).views("test")
+        for (name, kind), lost in product((("labels", "true"), ("labels_noisy", "wrong")), LOST):
+            train = Dataset(folder, name).views("train")
+            masks = tracked(labels_of(train), lost)
+            views = [View.from_arrays(view.camera, masks[view.name]) for view in train]
+            ids = max(int(labels.max()) for labels in masks.values())
+            row = [folder.name, kind, f"{lost:.0%}", str(ids)]
+            for find in (False, True):
+                learner, _ = learnt(scene, views, find)
+                result = Segmentation.from_codes(scene, learner.codes_, {}, evidence=learner.evidence())
+                ious, objects = object_ious(labels_of(tests), label_maps(scene, result, tests))
+                row += [points(float(ious.mean())), str(objects)]
+            lines.append([*row, str(len(ious))])
+            print(*lines[-1], sep=", ", flush=True)
+    columns = ["scene", "masks", "lost", "ids", "global: IoU", "objects", "per-view: IoU", "objects", "true"]
+    return markdown(columns, lines)
+
+
+def tracked(masks: Masks, lost: float) -> Masks:
+    """Give objects the numbers of a tracker that goes through the views in the order of their names, and loses some."""
+    random, now, count, found = np.random.default_rng(0), dict[int, int](), 0, {}
+    for name, labels in sorted(masks.items()):
+        before, now = now, {}
+        for k in np.unique(labels[labels > 0]).tolist():
+            kept = k in before and random.random() >= lost
+            count += not kept
+            now[k] = before[k] if kept else count
+        found[name] = renamed(labels, {0: 0, UNKNOWN: UNKNOWN, **now})
+    return found
 
 
 def reliability(scene: GaussianScene, result: Segmentation, tests: list[View], found: Masks) -> ReliabilityDiagram:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Mapping
 from contextlib import ExitStack
 from dataclasses import replace
 from functools import partial
@@ -28,6 +27,7 @@ from gsseg_core.learn.learner import Learner
 from gsseg_core.learn.mask_reliability import MaskChecker, reliability_report, shown_views
 from gsseg_core.learn.prepared_views import default_budget
 from gsseg_core.learn.registry import make_learner
+from gsseg_core.learn.renamed_ids import renamed_report
 from gsseg_core.learn.usable_views import NO_MASK, SEES_NOTHING
 from gsseg_core.progress import Progress, Stopwatch, silent, with_progress
 from gsseg_core.refine.label_propagation import UNKNOWN_SHARE, GraphSettings, propagate
@@ -144,7 +144,7 @@ def segment(
                     inputs = _associate(inputs, device, progress)
             run.claim(settings.places(inputs.class_names, inputs.pictured))
             fitted = _learn(inputs, settings, client, watch, progress)
-            assessment = _assess(fitted, inputs.class_names, watch, progress)
+            assessment = _assess(fitted, inputs, watch, progress)
         codes, evidence = fitted.code_rows_, fitted.evidence()
         spreads = settings.graph if assessment.calibration.unknown > UNKNOWN_SHARE else None
         settings = replace(settings, graph=spreads, learner_settings=getattr(fitted, "settings", None))
@@ -255,14 +255,16 @@ def _learn(
     return learner
 
 
-def _assess(learner: Learner, class_names: Mapping[int, str], watch: Stopwatch, progress: Progress) -> Assessment:
+def _assess(learner: Learner, inputs: Inputs, watch: Stopwatch, progress: Progress) -> Assessment:
     """Compare each mask with what the other views predict, where the learner can tell, and calibrate."""
-    checks, checker, reliability = None, None, {}
+    checks, checker, reliability = None, None, dict[str, Any]()
     if learner.checks_masks:
         with watch.stage("check views"):
             checker = MaskChecker(learner)
             checks = checker.check_all(progress)
-            reliability = {"reliability": reliability_report(checks, class_names)}
+            reliability["reliability"] = reliability_report(checks, inputs.class_names)
+            if inputs.objects is None:
+                reliability["renamed"] = renamed_report(checks, inputs.class_names)
     with watch.stage("calibrate"):
         calibration = calibrate(learner, checker, progress)
     views = {"used": len(learner.views), "rejected": learner.reject_summary(), "names": learner.rejected, **reliability}

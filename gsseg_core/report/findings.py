@@ -76,6 +76,19 @@ def has_objects(report: Mapping[str, Any]) -> bool:
     return any(entry["gaussians"] for entry in report["classes"] if entry["id"])
 
 
+def renamed_ids_of(report: Mapping[str, Any]) -> str:
+    """Say in a sentence without its stop which ids name objects that have another, and what to do; "" if none does."""
+    renamed = report["views"].get("renamed")
+    if not renamed:
+        return ""
+    pairs = _some([f"{entry['name']} ({entry['others_say']})" for entry in renamed])
+    return (
+        f"other views call {counted(len(renamed), 'id')} by another that no mask shows beside it: {pairs}. Did a "
+        "tracker lose objects and name them anew, or are there two names for one thing? --ids per-view finds objects "
+        "whatever their ids are, and --label-map puts names together"
+    )
+
+
 def warnings_of(report: Mapping[str, Any], ious: np.ndarray | None) -> list[str]:
     """Say in sentences what about a run should make its user look twice, what weighs most first.
 
@@ -99,6 +112,8 @@ def warnings_of(report: Mapping[str, Any], ious: np.ndarray | None) -> list[str]
             f"{100 - round(100 * TRUSTED)} % of {'their' if len(doubtful) > 1 else 'its'} pixels: "
             f"{_some([view['name'] for view in doubtful])}. Wrong ids, a wrong pose, or a mask of another image?"
         )
+    if renamed := renamed_ids_of(report):
+        warnings.append(f"{renamed[:1].upper()}{renamed[1:]}.")
     names = dict(enumerate(entry["name"] for entry in report["classes"]))
     empty = [entry["name"] for entry in report["classes"] if entry["id"] and not entry["gaussians"]]
     if empty and report.get("ids"):
