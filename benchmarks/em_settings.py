@@ -37,7 +37,7 @@ LEARNING: Group = {
     "least_agreement": (0.025, 0.1),
     "majority": (2.0, 8.0),
     "tolerance": (0.00125, 0.005),
-    "COVERED": (0.12, 0.5),
+    "CLAIMED": (0.1, 0.4),
 }
 BOUNDARIES: Group = {"SHARPNESS": (2.0, 4.5), "SHORTEST": (1, 6), "TELLING": (1.5, 2.0)}
 KINDS = {
@@ -148,7 +148,7 @@ Made by `python benchmarks/em_settings.py`. Machine: {machine}.
 What other values of its settings would give `em`, in points of mIoU against what it has: mean, worst and best over five
 scenes, each with several kinds of masks ([regret.md](regret.md) says which). Every seventh train view was held out from
 learning, and scored against true masks; no test view was looked at. `SHARPNESS`, `SHORTEST` and `TELLING` are those of
-`gsseg_core/learn/em/boundary_alignment.py`, `COVERED` is that of `gsseg_core/learn/em/rejected_regions.py`, the others
+`gsseg_core/learn/em/boundary_alignment.py`, `CLAIMED` is that of `gsseg_core/learn/em/rejected_regions.py`, the others
 are of `EMSettings`.
 
 {table}

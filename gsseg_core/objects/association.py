@@ -326,7 +326,8 @@ def _match(pairs: _Pairs, num: int) -> np.ndarray:
 def _move(stack: Stack, objects: np.ndarray, settings: AssociationSettings) -> np.ndarray:
     """Give every segment to the object that explains it best by what the other views say.
 
-    That ends when none moves any more, or when some do nothing but change places with each other.
+    That ends when none moves any more. Two of which either is explained best by the other would change places for ever:
+    where one would go back to where it came from, both come together in the larger of the two objects.
     """
     before, weights = objects, stack.weights().T.tocsr()
     by_gaussian = weights.indptr, weights.indices, weights.data
@@ -336,8 +337,10 @@ def _move(stack: Stack, objects: np.ndarray, settings: AssociationSettings) -> n
         best, known = explain_segments(views, *add_objects(*by_gaussian, before, num), before, num)
         seen = np.divide(known, stack.size, out=np.zeros_like(known), where=stack.size > 0)
         moves = ~stack.background & (seen >= settings.unseen)
-        objects = np.where(moves, best, before)
-        if (objects == before).all() or (objects == earlier).all():
+        size = np.bincount(before, stack.size, num)
+        stays = (best == earlier) & (size[best] < size[before])
+        objects = np.where(moves & ~stays, best, before)
+        if (objects == before).all():
             break
     return objects
 

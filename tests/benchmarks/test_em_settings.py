@@ -25,7 +25,7 @@ def test_every_value_is_learnt_with_once_and_none_that_is_known() -> None:
 def test_a_setting_has_its_value_for_as_long_as_it_is_tried() -> None:
     with setting("majority", 2.0) as settings:
         assert settings == EMSettings(majority=2.0)
-    for module, name in ((rejected_regions, "COVERED"), (boundary_alignment, "TELLING")):
+    for module, name in ((rejected_regions, "CLAIMED"), (boundary_alignment, "TELLING")):
         before = getattr(module, name)
         with setting(name, 9.0) as settings:
             assert getattr(module, name) == 9.0 and settings == EMSettings()

@@ -146,6 +146,20 @@ def test_one_other_class_speaks_against_a_label_more_than_many(rivals: int, expe
     np.testing.assert_array_equal(rejected, expected)
 
 
+@pytest.mark.parametrize(("rivals", "expected"), [(1, True), (4, True), (6, False)])
+def test_what_others_saw_of_a_region_speaks_against_its_label_only_if_one_class_has_enough_of_it(
+    rivals: int, expected: bool
+) -> None:
+    view = clean_views(1)[0]
+    learner = EMLearner(SCENE, NUM_CLASSES + rivals)
+    learner.observe(view)
+    votes = learner._votes.dense()
+    votes[:, NUM_CLASSES:] = votes.sum(axis=1)[:, None] / rivals  # As where others see it through gaps.
+    observation, possible = learner._prepared.in_memory[view.name], np.ones(NUM_CLASSES + rivals, bool)
+    rejected = find_rejected(CSRRows.from_dense(votes), observation, possible, EMSettings().least_agreement)
+    np.testing.assert_array_equal(rejected, expected)
+
+
 def test_a_region_without_its_label_still_tells_what_its_pixels_are() -> None:
     views = clean_views(6)
     labels = views[2].read_labels()

@@ -2,10 +2,10 @@
 
 Most errors of a segmenter sit in one place: a blob of clutter, an object under another's id, a whole bad frame. The
 confusion matrix of a view, the same all over it, does not model them. So each *region* of a mask, connected pixels of
-one label, is tested against the votes of all other views. Where they saw enough of it, and next to nothing of that has
-its label, the label is rejected. What is rejected has no say against others: each is tested once more, by the votes
-that are left. The pixels still belong together, so the region becomes a word of its own in the view's vocabulary, of
-which the confusion matrix tells what it means. docs/method.md has the reasons.
+one label, is tested against the votes of all other views. Where they give enough of it to one class, and next to
+nothing to that of its label, the label is rejected. What is rejected has no say against others: each is tested once
+more, by the votes that are left. The pixels still belong together, so the region becomes a word of its own in the
+view's vocabulary, of which the confusion matrix tells what it means. docs/method.md has the reasons.
 """
 
 from __future__ import annotations
@@ -22,8 +22,8 @@ from gsseg_core.raster.observation import Observation
 
 SMALLEST = 64  # regions of fewer px are not split: all of one label are tested as one
 
-COVERED = 0.25
-"""Share of a region, by weight, that the other views must have seen as well as this one for it to be rejected."""
+CLAIMED = 0.2
+"""Share of a region, by weight, that the other views must give to one class for it to be rejected."""
 
 RIVALLED = 2.0
 """Where one other class has a region by the votes of the other views, this many times the share is asked for."""
@@ -58,8 +58,8 @@ def find_rejected(
     By the votes of the others, each class has some weight under a label. The label is contradicted if its own class has
     less than the share `least` of all that weight, or less than `RIVALLED` times `least` of what another class has: one
     class all over speaks more against a label than an even mixture of many. A Gaussian counts for no more px than the
-    others saw of it: what shows through a gap in another view is little evidence. A region of which they saw too little
-    is kept.
+    others saw of it: what shows through gaps in other views is little evidence, and of many classes. A region of which
+    they give too little to any one class is kept.
 
     If there are `doubted` labels, (L,) bool, only they can be rejected, and their votes are not among the votes. The
     other parameters are those of `leave_one_out_counts`, with the votes on the device.
@@ -71,7 +71,7 @@ def find_rejected(
     counts = kernels_on(device).leave_one_out_counts(votes, observation, possible, voted_with, most=1.0)
     label = np.arange(len(evidence.informative))
     covered, rival = counts.sum(axis=0), counts.max(axis=0)
-    enough = covered >= COVERED * observation.votes_by_label()
+    enough = rival > CLAIMED * observation.votes_by_label()
     rejected: np.ndarray = enough & (counts[evidence.named(), label] < least * np.maximum(covered, RIVALLED * rival))
     return rejected if doubted is None else rejected & doubted
 
