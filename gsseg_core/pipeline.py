@@ -263,8 +263,8 @@ def _assess(learner: Learner, inputs: Inputs, watch: Stopwatch, progress: Progre
             checker = MaskChecker(learner)
             checks = checker.check_all(progress)
             reliability["reliability"] = reliability_report(checks, inputs.class_names)
-            if inputs.objects is None:
-                reliability["renamed"] = renamed_report(checks, inputs.class_names)
+            if inputs.objects is None and (renamed := renamed_report(checks, inputs.class_names)):
+                reliability["renamed"] = renamed
     with watch.stage("calibrate"):
         calibration = calibrate(learner, checker, progress)
     views = {"used": len(learner.views), "rejected": learner.reject_summary(), "names": learner.rejected, **reliability}
