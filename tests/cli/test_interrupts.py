@@ -64,7 +64,7 @@ def run(program: str, *arguments: str) -> subprocess.CompletedProcess[str]:
 
 @pytest.mark.parametrize(
     ("every", "arguments", "told"),
-    [(1, ["completion", "bash"], ""), (151, ["segment", "no.ply", "--data", "no", "--out", "no", "--quiet"], "no.ply")],
+    [(1, ["completion", "bash"], ""), (113, ["segment", "no.ply", "--data", "no", "--out", "no", "--quiet"], "no.ply")],
 )
 def test_ctrl_c_at_any_import_ends_with_130_and_not_a_word(every: int, arguments: list[str], told: str) -> None:
     done = run(COPIES, str(every), *arguments)
