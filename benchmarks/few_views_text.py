@@ -32,7 +32,8 @@ benchmarks/graph_term.py`). [method.md](method.md#the-graph) has its formula, an
 ONE_VIEW = """## One object from one view
 
 `gsseg pick SCENE.ply --data DATASET --view STEM --mask FILE --out DIR`, with more pairs of `--view` and `--mask` for
-more masks; in Python `pick_mask`, `pick_masks` and `pick_clicks`.
+more masks, and `--label` where the object is one label of several; in Python `pick_mask`, `pick_masks` and
+`pick_clicks` of `gsseg_core.objects.pick`.
 
 Each object is shown in the train view in which it is
 largest (at least {least} px), once by its true mask and once by a click on the pixel farthest from its outline, and
