@@ -16,6 +16,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
+from em_settings import setting
 from machine import DATA, describe
 from regret import SCENES, Bench, open_bench
 from results import markdown, points, score
@@ -68,12 +69,11 @@ def measure(bench: Bench, kind: str, count: int) -> list[float]:
     """Learn from some views with each value of `CLAIMED`: mIoU."""
     learner = EMLearner(bench.scene, bench.data.num_classes)
     learner.observe_all(spread(list(bench.views(kind)), count))
-    mious, before = [], rejected_regions.CLAIMED
+    mious = []
     for value in CLAIMED:
-        rejected_regions.CLAIMED = value
-        result = Segmentation.from_codes(bench.scene, learner.fit().codes_, bench.data.class_names)
+        with setting("CLAIMED", value):
+            result = Segmentation.from_codes(bench.scene, learner.fit().codes_, bench.data.class_names)
         mious.append(score(result, bench.scene, bench.truth).mean_iou)
-    rejected_regions.CLAIMED = before
     return mious
 
 

@@ -32,8 +32,8 @@ from gsseg_core.scene.gaussian_scene import GaussianScene
 from gsseg_core.several_at_once import several_at_once
 
 LUMINANCE = np.array([0.299, 0.587, 0.114], np.float32)  # of RGB, ITU-R BT.601
-_EDGE_PX = 3  # reach of the filter that finds edges, px of a picture
-_REACH = 4  # standard deviations of the filter, of 1 px, to either side
+_EDGE_PX = 3  # px of a picture along the border of its image whose edges are not compared
+_REACH = 4  # px to either side that are weighed by the filter, a Gaussian of 1 px standard deviation
 _BLUR = np.exp(-0.5 * np.arange(-_REACH, _REACH + 1, dtype=np.float32) ** 2)  # its weights
 _BLUR /= _BLUR.sum()
 _SLOPE = np.arange(-_REACH, _REACH + 1, dtype=np.float32) * _BLUR  # of a blurred picture, a px
@@ -224,10 +224,8 @@ def _gradient(picture: np.ndarray) -> np.ndarray:  # (S, S)
 
 def _filtered(picture: np.ndarray, down: np.ndarray, across: np.ndarray) -> np.ndarray:  # (S, S), (T,), (T,)
     """Weigh the neighbours of each pixel; SciPy's filters take longer to load than all pictures that are compared."""
-    padded = np.pad(picture, _REACH, "symmetric")
-    filtered: np.ndarray = (
-        sliding_window_view(sliding_window_view(padded, len(down), 0) @ down, len(across), 1) @ across
-    )
+    columns = sliding_window_view(np.pad(picture, _REACH, "symmetric"), len(down), 0) @ down
+    filtered: np.ndarray = sliding_window_view(columns, len(across), 1) @ across
     return filtered
 
 

@@ -20,14 +20,15 @@ def renamed_ids(checks: Sequence[ViewCheck]) -> dict[int, int]:
 
     Returns, by each such id, ascending, the one of these that most pixels are given to.
     """
-    given, label, counts = (np.concatenate(each) for each in zip(*(check.cells() for check in checks), strict=True))
+    cells = [check.cells() for check in checks]
+    given, label, counts = (np.concatenate(each) for each in zip(*cells, strict=True))
     width = int(max(given.max(initial=0), label.max(initial=0))) + 1
     pairs, place = np.unique(label * width + given, return_inverse=True)
     (label, given), counts = np.divmod(pairs, width), np.bincount(place, counts)
     together, views = (label == 0) | (given == 0), np.zeros(width, np.int64)
-    for check in checks:
+    for _, labels, _ in cells:
         shown = np.zeros(width, bool)
-        shown[check.cells()[1]] = True
+        shown[labels] = True
         views += shown
         together |= shown[label] & shown[given]
     pixels, apart = (np.bincount(label, weights, width) for weights in (counts, np.where(together, 0, counts)))
