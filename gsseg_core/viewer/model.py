@@ -107,13 +107,15 @@ class ViewModel:
         """Ids of all classes, by label; those that were added in the viewer have the smallest free ones."""
         if self.labelling.nodes is not None:
             return list(self.labelling.nodes)
-        free = (i for i in range(len(self.class_ids) + len(self.labelling.class_names)) if i not in self.class_ids)
-        return [*self.class_ids, *free][: len(self.labelling.class_names)]
+        given, count = {*self.class_ids}, len(self.labelling.class_names)
+        free = (i for i in range(len(given) + count) if i not in given)
+        return [*self.class_ids, *free][:count]
 
     def relabel(self, labelling: Labelling) -> None:
         """Show what is known now; what was switched off stays so."""
         self.labelling = labelling
-        self.__dict__.pop("confidence", None)
+        for of_the_last in ("confidence", "_palette"):
+            self.__dict__.pop(of_the_last, None)
 
     @cached_property
     def confidence(self) -> np.ndarray:
@@ -191,7 +193,7 @@ class ViewModel:
         grey = self._true_colors.mean(axis=1, keepdims=True, dtype=np.float32)
         return np.rint(grey + FILL * (by_class - grey)).astype(np.uint8)
 
-    @property
+    @cached_property
     def _palette(self) -> np.ndarray:
         """Colours by label, (K + 2, 3) uint8: labels -1 and -2, which are no class, are its last two."""
         nodes = self.labelling.nodes or range(max(self.labelling.class_names, default=0) + 1)
@@ -203,8 +205,8 @@ class ViewModel:
         return np.rint(self.scene.colors() * 255).astype(np.uint8)
 
     def _listed(self, label: int) -> int:
-        if label not in self.labels_in_use:
-            raise UnknownLabelError(f"class {label} is not in the list; expected one of {self.labels_in_use}")
+        if label not in (listed := self.labels_in_use):
+            raise UnknownLabelError(f"class {label} is not in the list; expected one of {listed}")
         return label
 
 

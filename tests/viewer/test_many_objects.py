@@ -10,11 +10,12 @@ import numpy as np
 import pytest
 from labellings import labelled, probabilities_of
 from parts_of_balls import tree_of_balls
-from small_scenes import NAMES, balls_on_a_table, ring
+from small_scenes import NAMES, balls_on_a_table, many_classes, ring
 
 from gsseg_core import csr_rows
 from gsseg_core.raster.backends import make_operator
 from gsseg_core.segmentation import REMOVED, UNOBSERVED, Segmentation
+from gsseg_core.viewer import model as view_model
 from gsseg_core.viewer.corrections import disc, region
 from gsseg_core.viewer.model import Labelling, ViewModel
 from gsseg_core.viewer.state import ViewerState
@@ -84,3 +85,30 @@ def test_a_map_of_labels_has_the_label_that_is_seen_most_and_says_where_nothing_
     expected = np.where(image.max(axis=2) > 0, used[image.argmax(axis=2)], -1)
     assert {-1, 1, 2} <= set(np.unique(expected).tolist())
     np.testing.assert_array_equal(state.label_map(CAMERA), expected)
+
+
+def test_a_press_on_one_of_many_classes_takes_time_by_their_number_and_not_by_its_square(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    scene, truth = many_classes(count := 200)
+    looks, palette = [], view_model.palette
+
+    class Id(int):
+        """An id that knows how often it was compared."""
+
+        __hash__ = int.__hash__
+
+        def __eq__(self, other: object) -> bool:
+            looks.append("an id")
+            return int(self) == other
+
+    monkeypatch.setattr(view_model, "palette", lambda size: looks.extend(["a colour"] * size) or palette(size))
+    names = {k: f"object {k}" for k in range(count)}
+    segmentation = Segmentation.from_codes(scene, np.eye(count, dtype=np.float32)[truth], names)
+    model = ViewModel(scene, Labelling.of(segmentation), class_ids=tuple(Id(k + 5 * (k > 0)) for k in range(count)))
+    model.isolate(7)
+    model.remove(8)
+    assert len(model.rows()) == count - 1 and model.ids()[-1] == count + 4
+    model.relabel(Labelling.of(segmentation))
+    model.toggle(9)
+    assert len(looks) <= 5 * count
