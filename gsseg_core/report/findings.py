@@ -4,12 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from gsseg_core.data.view import View
-from gsseg_core.learn.mask_reliability import ViewCheck, largest_cells
+from gsseg_core.learn.mask_reliability import ViewCheck
 from gsseg_core.metrics import iou
 from gsseg_core.text import counted
 
@@ -24,6 +24,44 @@ NO_OBJECTS = (
 NOTED = 5  # names in a warning, at most
 
 
+class Confusion(NamedTuple):
+    """Pixels of all views by class predicted and label of the mask, where there are any: (Z,) int64 each.
+
+    They are in the order of the classes predicted, and of the labels for each. Of thousands of classes, few are taken
+    for each other.
+    """
+
+    predicted: np.ndarray
+    labels: np.ndarray
+    pixels: np.ndarray
+
+    def ious(self, num_classes: int) -> np.ndarray:
+        """IoU of each class between prediction and masks, (K,); NaN for a class that is in neither."""
+        right = self.predicted == self.labels
+        both = np.bincount(self.labels[right], self.pixels[right], num_classes)
+        return iou(both, *(np.bincount(side, self.pixels, num_classes) for side in (self.labels, self.predicted)))
+
+    def largest(self, count: int) -> list[tuple[int, int, int]]:
+        """List what was most often taken for something else: class predicted, label of the mask, pixels."""
+        wrong = np.flatnonzero(self.predicted != self.labels)
+        chosen = wrong[np.argsort(-self.pixels[wrong], kind="stable")[:count]]
+        return list(zip(*(column[chosen].tolist() for column in self), strict=True))
+
+    def most_confused(self, count: int) -> np.ndarray:
+        """Choose the classes in most of which prediction and mask differ, `count` at most: ascending."""
+        classes, place = np.unique(np.concatenate([self.predicted, self.labels]), return_inverse=True)
+        wrong = np.bincount(place, np.tile(np.where(self.predicted != self.labels, self.pixels, 0), 2))
+        return np.sort(classes[np.argsort(-wrong, kind="stable")[:count]])
+
+    def shares(self, classes: np.ndarray) -> np.ndarray:
+        """Share of the pixels of each class predicted (row) that are of each label, (C, C) for some of the classes."""
+        of_class, shares = np.bincount(self.predicted, self.pixels), np.zeros((len(classes), len(classes)))
+        there = np.isin(self.predicted, classes) & np.isin(self.labels, classes)
+        row, column = (np.searchsorted(classes, side[there]) for side in (self.predicted, self.labels))
+        shares[row, column] = self.pixels[there] / of_class[self.predicted[there]]
+        return shares
+
+
 @dataclass(frozen=True, eq=False)
 class MaskChecks:
     """Masks beside predictions of them."""
@@ -32,18 +70,11 @@ class MaskChecks:
     views: Mapping[str, View]  # at least those
     held_out: bool  # whether a prediction comes from the other views alone; else also from the view itself
 
-    def confusion(self) -> tuple[np.ndarray, np.ndarray]:
-        """Count pixels by class predicted (row) and label of the mask (column), over all views.
-
-        Returns the classes that are in either, (C,) int64 ascending, and their counts, (C, C) int64: of tens of
-        thousands of names, few occur. "None of these" of a partial mask is no class, and is not counted.
-        """
-        cells = [check.cells() for check in self.checks]
-        rows, columns, counts = (np.concatenate(parts) for parts in zip(*cells, strict=True))
-        classes = np.union1d(rows, columns)
-        table = np.zeros((len(classes), len(classes)), np.int64)
-        np.add.at(table, (np.searchsorted(classes, rows), np.searchsorted(classes, columns)), counts)
-        return classes, table
+    def confusion(self) -> Confusion:
+        """Count pixels over all views. "None of these" of a partial mask is no class, and is not counted."""
+        rows, columns, counts = map(np.concatenate, zip(*(check.cells() for check in self.checks), strict=True))
+        pairs, place = np.unique(rows << 32 | columns, return_inverse=True)
+        return Confusion(pairs >> 32, pairs & 0xFFFFFFFF, np.bincount(place, counts).astype(np.int64))
 
     def views_showing(self, num_classes: int) -> np.ndarray:
         """Count the views that show each class, by what is predicted: (K,) int64."""
@@ -52,23 +83,6 @@ class MaskChecks:
             shown = check.counts.sum(axis=1)
             views += (shown > 0) & (shown >= SHOWN * check.checked)
         return views
-
-
-def class_ious(confusion: np.ndarray) -> np.ndarray:
-    """IoU of each class between prediction and masks, (C,) of (C, C) pixels; NaN for a class that is in neither."""
-    return iou(confusion.diagonal(), confusion.sum(axis=0), confusion.sum(axis=1))
-
-
-def largest_confusions(confusion: np.ndarray, count: int) -> list[tuple[int, int, int]]:
-    """List what was most often taken for something else in (C, C) pixels: class predicted, label of the mask, count."""
-    return largest_cells(confusion - np.diag(confusion.diagonal()), count)
-
-
-def most_confused(confusion: np.ndarray, count: int) -> list[int]:
-    """Choose by (C, C) pixels the classes in most of which prediction and mask differ, `count` at most, by place."""
-    wrong = confusion.sum(axis=0) + confusion.sum(axis=1) - 2 * confusion.diagonal()
-    order = [int(k) for k in np.argsort(-wrong, kind="stable")[:count] if confusion[k].any() or confusion[:, k].any()]
-    return sorted(order)
 
 
 def has_objects(report: Mapping[str, Any]) -> bool:

@@ -12,7 +12,7 @@ import numpy as np
 from gsseg_core.data.object_tree import ObjectTree
 from gsseg_core.export.pictures import FAINT_INK, overlay, palette, shown_at
 from gsseg_core.learn.mask_reliability import ranked_examples
-from gsseg_core.report.findings import TRUSTED, MaskChecks, class_ious, largest_confusions, most_confused
+from gsseg_core.report.findings import TRUSTED, Confusion, MaskChecks
 from gsseg_core.report.pictures import PICTURE_PX, THUMBNAIL_PX, ViewImages, draw_triple, jpeg_uri, thumbnails
 from gsseg_core.report.preview import look_from, make_preview, up_of
 from gsseg_core.scene.gaussian_scene import GaussianScene
@@ -48,22 +48,14 @@ class PageInputs:
         return palette(self.segmentation.num_classes)
 
     @cached_property
-    def confusion(self) -> tuple[np.ndarray, np.ndarray] | None:
-        """Classes that occur, (C,), and pixels by class predicted and label of the mask, (C, C) int64.
-
-        None where no mask was checked.
-        """
+    def confusion(self) -> Confusion | None:
+        """What the masks' pixels were predicted to be; None where no mask was checked."""
         return self.checked.confusion() if self.checked.checks else None
 
     @cached_property
     def ious(self) -> np.ndarray | None:
         """IoU of each class with the masks, (K,), NaN for a class that is nowhere; None where no mask was checked."""
-        if self.confusion is None:
-            return None
-        classes, counts = self.confusion
-        ious = np.full(self.segmentation.num_classes, np.nan)
-        ious[classes] = class_ious(counts)
-        return ious
+        return None if self.confusion is None else self.confusion.ious(self.segmentation.num_classes)
 
     @cached_property
     def nodes(self) -> list[tuple[int, str, int]]:
@@ -171,20 +163,16 @@ def classes(run: PageInputs) -> Content:
 
 def confusion(run: PageInputs) -> Content | None:
     """Matrix of the classes that are confused most, and the largest confusions."""
-    if run.confusion is None:
+    if (found := run.confusion) is None:
         return None
-    classes, counts = run.confusion
-    names = [run.segmentation.class_names[k] for k in classes.tolist()]
-    shown = most_confused(counts, MATRIX_CLASSES)
-    of_class = counts.sum(axis=1, keepdims=True)
-    shares = (counts / np.maximum(of_class, 1))[np.ix_(shown, shown)]
+    names, shown = run.segmentation.class_names, found.most_confused(MATRIX_CLASSES)
+    shares, total = found.shares(shown), max(int(found.pixels.sum()), 1)
     shares[shares < 0.002] = 0
-    total = max(int(counts.sum()), 1)
     return {
-        "names": [names[k] for k in shown],
+        "names": [names[k] for k in shown.tolist()],
         "shares": shares.tolist(),
-        "most": len(shown) if len(shown) < (of_class > 0).sum() else None,
-        "pairs": [(names[k], names[y], pixels, pixels / total) for k, y, pixels in largest_confusions(counts, PAIRS)],
+        "most": len(shown) if len(shown) < len(np.unique(found.predicted)) else None,
+        "pairs": [(names[k], names[y], pixels, pixels / total) for k, y, pixels in found.largest(PAIRS)],
     }
 
 

@@ -2,19 +2,15 @@
 
 from __future__ import annotations
 
+import tracemalloc
+
 import numpy as np
 import pytest
 from report_cases import minimal_report
 
 from gsseg_core.data.label_images import UNKNOWN
 from gsseg_core.learn.mask_reliability import ViewCheck, ranked_examples
-from gsseg_core.report.findings import (
-    MaskChecks,
-    class_ious,
-    largest_confusions,
-    most_confused,
-    warnings_of,
-)
+from gsseg_core.report.findings import Confusion, MaskChecks, warnings_of
 
 
 def check(name: str, classes: list[int], counts: list[list[int]]) -> ViewCheck:
@@ -22,30 +18,57 @@ def check(name: str, classes: list[int], counts: list[list[int]]) -> ViewCheck:
     return ViewCheck(name, int(pixels.sum()), np.array(classes, np.int32), pixels)
 
 
+def written_out(confusion: Confusion) -> tuple[list[int], np.ndarray]:
+    """The classes that occur, and pixels by class predicted (row) and label of the mask (column)."""
+    classes = np.union1d(confusion.predicted, confusion.labels)
+    table = np.zeros((len(classes), len(classes)), np.int64)
+    table[np.searchsorted(classes, confusion.predicted), np.searchsorted(classes, confusion.labels)] = confusion.pixels
+    return classes.tolist(), table
+
+
 def test_confusion_is_the_sum_over_views_and_ignores_what_is_no_class() -> None:
     one = check("one", [0, 2], [[50, 3], [10, 0], [7, 30]])
     other = check("other", [1, UNKNOWN], [[4, 1], [5, 1], [0, 1]])
-    classes, confusion = MaskChecks([one, other], {}, True).confusion()
-    assert classes.tolist() == [0, 1, 2]
-    np.testing.assert_array_equal(confusion, [[50, 4, 3], [10, 5, 0], [7, 0, 30]])
-    np.testing.assert_allclose(class_ious(confusion), [50 / 74, 5 / 19, 30 / 40])
-    assert largest_confusions(confusion, 3) == [(1, 0, 10), (2, 0, 7), (0, 1, 4)]
-    assert most_confused(confusion, 2) == [0, 1]
+    confusion = MaskChecks([one, other], {}, True).confusion()
+    classes, table = written_out(confusion)
+    assert classes == [0, 1, 2]
+    np.testing.assert_array_equal(table, [[50, 4, 3], [10, 5, 0], [7, 0, 30]])
+    np.testing.assert_allclose(confusion.ious(3), [50 / 74, 5 / 19, 30 / 40])
+    assert confusion.largest(3) == [(1, 0, 10), (2, 0, 7), (0, 1, 4)]
+    assert confusion.most_confused(2).tolist() == [0, 1]
+    np.testing.assert_allclose(confusion.shares(np.array([0, 2])), [[50 / 57, 3 / 57], [7 / 37, 30 / 37]])
 
 
 def test_confusion_is_of_the_classes_that_occur_however_many_names_there_are() -> None:
     pixels = np.zeros((65_535, 2), np.int64)
     pixels[[7, 7, 60_000], [0, 1, 1]] = 5, 2, 9
-    classes, confusion = MaskChecks([ViewCheck("one", 16, np.array([3, 60_000]), pixels)], {}, True).confusion()
-    assert classes.tolist() == [3, 7, 60_000]
-    np.testing.assert_array_equal(confusion, [[0, 0, 0], [5, 0, 2], [0, 0, 9]])
-    assert [check.tolist() for check in MaskChecks([check("blank", [0], [[0]])], {}, True).confusion()] == [[], []]
+    confusion = MaskChecks([ViewCheck("one", 16, np.array([3, 60_000]), pixels)], {}, True).confusion()
+    classes, table = written_out(confusion)
+    assert classes == [3, 7, 60_000]
+    np.testing.assert_array_equal(table, [[0, 0, 0], [5, 0, 2], [0, 0, 9]])
+    blank = MaskChecks([check("blank", [0], [[0]])], {}, True).confusion()
+    assert [column.tolist() for column in blank] == [[], [], []]
+    assert blank.largest(3) == blank.shares(blank.most_confused(3)).tolist() == [] and np.isnan(blank.ious(1)).all()
+
+
+def test_confusion_of_thousands_of_classes_takes_memory_by_those_that_are_confused() -> None:
+    classes = np.arange(many := 20_000)
+    tracemalloc.start()
+    try:
+        confusion = Confusion(np.append(classes, 7), np.append(classes, 9), np.full(many + 1, 5))
+        assert confusion.largest(2) == [(7, 9, 5)] and confusion.most_confused(2).tolist() == [7, 9]
+        assert confusion.shares(np.array([7, 9])).tolist() == [[0.5, 0.5], [0, 1]]
+        assert confusion.ious(many)[[0, 7, 9]].tolist() == [1, 0.5, 0.5]
+        assert tracemalloc.get_traced_memory()[1] < many**2
+    finally:
+        tracemalloc.stop()
 
 
 def test_iou_of_a_class_that_is_nowhere_is_not_a_number() -> None:
-    ious = class_ious(np.diag([3, 0, 2]))
+    confusion = Confusion(np.array([0, 2]), np.array([0, 2]), np.array([3, 2]))
+    ious = confusion.ious(3)
     assert ious[0] == ious[2] == 1 and np.isnan(ious[1])
-    assert most_confused(np.diag([3, 0, 2]), 5) == [0, 2]
+    assert confusion.most_confused(5).tolist() == [0, 2]
 
 
 def test_a_view_shows_what_fills_more_than_a_few_of_its_pixels() -> None:
