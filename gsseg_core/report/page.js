@@ -136,8 +136,8 @@ for (const field of document.querySelectorAll(".search")) {
   gl.uniform2fv(uniform("logScales"), data.logScales);
   gl.uniform3fv(uniform("core"), data.core.flat());
 
-  // One texel a class: its colour, and whether it is shown. 256 in a row.
-  const rows = Math.ceil(data.colors.length / 256), classes = new Uint8Array(1024 * rows);
+  // One texel a label that occurs: its colour, and whether it is shown. 256 in a row.
+  const rows = Math.ceil(data.labels.length / 256), classes = new Uint8Array(1024 * rows);
   function makeTexture(unitIndex, filter) {
     gl.activeTexture(gl.TEXTURE0 + unitIndex);
     gl.bindTexture(gl.TEXTURE_2D, gl.createTexture());
@@ -213,11 +213,12 @@ for (const field of document.querySelectorAll(".search")) {
   const level = () => levelSlider && data.levels[levelSlider.value];
   function showClasses() {
     const nodes = level()?.nodes, on = new Map(boxes.map((box) => [Number(box.dataset.label), box.checked]));
-    data.colors.forEach((color, k) => {
-      // What was taken out is drawn as what it covers.
-      const label = k < unobserved ? k : k - data.removed, node = label < 0 ? unobserved : nodes ? nodes[label] : label;
-      const shown = on.get(k < unobserved ? node : Math.min(k, data.removed)) ?? true;
-      classes.set([...data.colors[node], shown ? 255 : 0], 4 * k);
+    data.labels.forEach((number, place) => {
+      // What was taken out is drawn as what it covers most: in a colour of its own it would be a stain.
+      const label = number < unobserved ? number : number - data.removed;
+      const node = label < 0 ? unobserved : nodes ? nodes[label] : label;
+      const shown = on.get(number < unobserved ? node : Math.min(number, data.removed)) ?? true;
+      classes.set([...data.colors[node], shown ? 255 : 0], 4 * place);
     });
     gl.texImage2D(gl.TEXTURE_2D, 0, gl.RGBA, 256, rows, 0, gl.RGBA, gl.UNSIGNED_BYTE, classes);
     redraw();

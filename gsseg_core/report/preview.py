@@ -34,12 +34,13 @@ RECORD = np.dtype(
 class Preview:
     """Gaussians to look at.
 
-    Positions are within `low` to `high`, scales as logarithms within `log_scales`, quaternions w, x, y, z. Labels are
-    as in the segmentation, or nodes of its tree; the number of all of these where unobserved; and where removed, that
-    number + 1 more than the most probable one.
+    Positions are within `low` to `high`, scales as logarithms within `log_scales`, quaternions w, x, y, z. The label of a
+    record is a place in `labels`. These are as in the segmentation, or nodes of its tree; the number of all of these
+    where unobserved; and where removed, that number + 1 more than the most probable one.
     """
 
     records: np.ndarray  # (M,) RECORD
+    labels: np.ndarray  # (L,) int64: those that occur, ascending; of all, there may be more than a record can number
     low: np.ndarray  # (3,) float64: the box that holds them, in scene units
     high: np.ndarray  # (3,) float64
     core: np.ndarray  # (2, 3) float64: corners of the box that holds all but those around the scene, to be looked at
@@ -50,6 +51,7 @@ class Preview:
         """Give what is needed to read the records, for JSON."""
         return {
             "count": len(self.records),
+            "labels": self.labels.tolist(),
             "low": self.low.tolist(),
             "high": self.high.tolist(),
             "core": self.core.tolist(),
@@ -92,13 +94,13 @@ def make_preview(
     others = first + np.where(labels == UNOBSERVED, 0, 1 + nodes[np.maximum(column, 0)])
     records = np.zeros(len(picked), RECORD)
     records["position"] = _quantised(means, low, high, 65535)
-    records["label"] = np.where(labels < 0, others, labels)
+    used, records["label"] = np.unique(np.where(labels < 0, others, labels), return_inverse=True)
     records["quat"] = np.rint(127 * scene.quats[picked])
     records["scale"] = _quantised(logs, log_scales[0], log_scales[1], 255)
     records["opacity"] = np.rint(255 * scene.opacities[picked])
     records["color"] = np.rint(255 * np.clip(scene.colors(ids=picked), 0, 1))
     records["confidence"] = np.rint(255 * np.clip(confidence, 0, 1))
-    return Preview(records, low, high, core, log_scales, len(scene) - len(picked))
+    return Preview(records, used.astype(np.int64), low, high, core, log_scales, len(scene) - len(picked))
 
 
 def _of_parts(shares: CSRRows, temperature: float, tree: ObjectTree, ids: np.ndarray) -> tuple[CSRRows, np.ndarray]:

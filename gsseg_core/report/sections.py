@@ -104,8 +104,7 @@ def preview(run: PageInputs) -> Content:
             **shown.header(),
             "cameras": look_from(cameras, shown),
             "up": up_of(view.camera for view in views.values()),
-            # What refinement took out is drawn as what it covers most: in a colour of its own it would be a stain.
-            "colors": [*colors.tolist(), FAINT_INK, *colors.tolist()],
+            "colors": [*colors.tolist(), FAINT_INK],
             "removed": first + 1,
             "levels": levels,
         },

@@ -16,7 +16,7 @@ from small_scenes import NUM_CLASSES, balls_on_a_table, look_at
 
 from gsseg_core.csr_rows import CSRRows
 from gsseg_core.data.object_tree import ObjectTree
-from gsseg_core.report.preview import RECORD, look_from, make_preview, up_of
+from gsseg_core.report.preview import RECORD, Preview, look_from, make_preview, up_of
 from gsseg_core.scene.gaussian_scene import GaussianScene
 from gsseg_core.segmentation import REMOVED, UNOBSERVED, Segmentation
 
@@ -31,6 +31,10 @@ def result_of(labels: np.ndarray, scene: GaussianScene = SCENE) -> Segmentation:
     return Segmentation(labels.astype(np.int32), rows, names, scene.digest, none, CSRRows.empty(0))
 
 
+def labels_of(preview: Preview) -> np.ndarray:
+    return preview.labels[preview.records["label"]]
+
+
 def test_preview_reads_back_to_half_a_step_and_marks_what_has_no_class() -> None:
     labels = TRUTH.copy()
     labels[:3], labels[3:5] = UNOBSERVED, REMOVED
@@ -41,10 +45,8 @@ def test_preview_reads_back_to_half_a_step_and_marks_what_has_no_class() -> None
     step = (preview.high - preview.low) / 65535
     means = preview.low + preview.records["position"] * step
     assert (np.abs(means - SCENE.means)[kept] <= 0.51 * step + 1e-6).all()
-    np.testing.assert_array_equal(preview.records["label"][5:], labels[5:])
-    assert (preview.records["label"][:3] == NUM_CLASSES).all() and (
-        preview.records["label"][3:5] == NUM_CLASSES + 1
-    ).all()
+    np.testing.assert_array_equal(labels_of(preview)[5:], labels[5:])
+    assert (labels_of(preview)[:3] == NUM_CLASSES).all() and (labels_of(preview)[3:5] == NUM_CLASSES + 1).all()
     low, high = preview.log_scales
     scales = np.exp(low + preview.records["scale"] / 255 * (high - low))
     np.testing.assert_allclose(scales[kept], SCENE.scales[kept], rtol=0.51 * (high - low) / 255 + 1e-6)
@@ -52,6 +54,18 @@ def test_preview_reads_back_to_half_a_step_and_marks_what_has_no_class() -> None
     np.testing.assert_allclose(preview.records["quat"] / 127, SCENE.quats, atol=0.51 / 127)
     assert (preview.records["confidence"] == 191).all()
     json.dumps(preview.header(), allow_nan=False)
+
+
+def test_a_preview_tells_what_was_taken_out_of_each_of_as_many_classes_as_masks_can_name() -> None:
+    classes = np.array([0, 1, 40_000, 65_534])
+    column = np.resize(classes, len(SCENE)).astype(np.uint32)
+    shares = CSRRows(np.arange(len(SCENE) + 1), column, np.ones(len(SCENE), np.float32))
+    names, none = {k: str(k) for k in range(65_535)}, np.zeros(len(SCENE), bool)
+    labels = np.where(np.arange(len(SCENE)) < 4, np.int32(REMOVED), column.astype(np.int32))
+    result = Segmentation(labels, shares, names, SCENE.digest, none, CSRRows.empty(0))
+    found = labels_of(make_preview(SCENE, result))
+    assert found[:4].tolist() == (65_536 + classes).tolist()
+    np.testing.assert_array_equal(found[4:], labels[4:])
 
 
 def test_a_thinned_preview_keeps_small_classes_covers_as_much_and_is_always_the_same() -> None:
@@ -64,10 +78,10 @@ def test_a_thinned_preview_keeps_small_classes_covers_as_much_and_is_always_the_
     preview, again = (make_preview(scene, result_of(labels, scene), 1000) for _ in range(2))
     np.testing.assert_array_equal(preview.records, again.records)
     assert len(preview.records) == 1000 and preview.left_out == 4000
-    assert np.bincount(preview.records["label"]).tolist() == [0, 900, 60, 40]
+    assert np.bincount(labels_of(preview)).tolist() == [0, 900, 60, 40]
     low, high = preview.log_scales
     areas = np.exp(2 * (low + preview.records["scale"][:, 0] / 255 * (high - low)))
-    np.testing.assert_allclose(np.bincount(preview.records["label"], areas)[1:] / 1e-4, [4900, 60, 40], rtol=0.1)
+    np.testing.assert_allclose(np.bincount(labels_of(preview), areas)[1:] / 1e-4, [4900, 60, 40], rtol=0.1)
 
 
 def test_a_preview_by_part_is_that_of_the_finest_level() -> None:
@@ -78,9 +92,10 @@ def test_a_preview_by_part_is_that_of_the_finest_level() -> None:
     result = replace(result_of(labels), shares=CSRRows.from_dense(codes), tree=tree_of_balls()).calibrated(0.6)
     fine = result.at(1.0)
     for most in (500, len(SCENE)):
-        found, expected = make_preview(SCENE, result, most, parts=True).records, make_preview(SCENE, fine, most).records
-        expected["label"][expected["label"] >= fine.num_classes] += len(tree_of_balls()) - fine.num_classes
-        np.testing.assert_array_equal(found, expected)
+        found, expected = make_preview(SCENE, result, most, parts=True), make_preview(SCENE, fine, most)
+        expected.labels[expected.labels >= fine.num_classes] += len(tree_of_balls()) - fine.num_classes
+        np.testing.assert_array_equal(found.labels, expected.labels)
+        np.testing.assert_array_equal(found.records, expected.records)
 
 
 def test_a_preview_by_part_takes_no_memory_for_the_parts_of_all_gaussians() -> None:
