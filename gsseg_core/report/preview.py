@@ -34,8 +34,8 @@ RECORD = np.dtype(
 class Preview:
     """Gaussians to look at.
 
-    Positions are within `low` to `high`, scales as logarithms within `log_scales`, quaternions w, x, y, z. The label of a
-    record is a place in `labels`. These are as in the segmentation, or nodes of its tree; the number of all of these
+    Positions are within `low` to `high`, scales as logarithms within `log_scales`, quaternions w, x, y, z. The label of
+    a record is a place in `labels`. These are as in the segmentation, or nodes of its tree; the number of all of these
     where unobserved; and where removed, that number + 1 more than the most probable one.
     """
 
