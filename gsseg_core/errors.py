@@ -129,3 +129,10 @@ def memory_ran_out(error: BaseException) -> bool:
         return True
     no_thread = isinstance(error, RuntimeError) and "can't start new thread" in str(error)
     return no_thread or (isinstance(error, ImportError) and "failed to map segment" in str(error))
+
+
+def explained(error: BaseException) -> str | None:
+    """Say what one of our errors says, or that memory is not enough; None of an error that nobody foresaw."""
+    if isinstance(error, GssegError):
+        return str(error)
+    return f"memory is not enough ({error})" if memory_ran_out(error) else None

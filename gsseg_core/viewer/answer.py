@@ -13,7 +13,7 @@ import numpy as np
 import viser
 
 from gsseg_core.data.class_names import class_name
-from gsseg_core.errors import GssegError, memory_ran_out
+from gsseg_core.errors import explained
 from gsseg_core.text import counted, html_text, printable
 from gsseg_core.viewer.picking import Picked, ViewVote
 from gsseg_core.viewer.state import ViewerState
@@ -72,9 +72,8 @@ class Answer:
         try:
             yield
         except Exception as error:
-            if not isinstance(error, GssegError) and not memory_ran_out(error):
+            if (what := explained(error)) is None:
                 raise
-            what = str(error) if isinstance(error, GssegError) else f"memory is not enough ({error})"
             if in_place:
                 with self._state.lock:
                     self._picked = None

@@ -84,11 +84,11 @@ class Corrections:
 
     def __init__(self, scene: GaussianScene, *, device: str = "cpu") -> None:
         self._scene, self._device = scene, device
-        self._drawn: list[Drawn] = []
+        self.drawn: tuple[Drawn, ...] = ()  # what each says
 
     def __len__(self) -> int:
         """Count the corrections."""
-        return len(self._drawn)
+        return len(self.drawn)
 
     def add(self, view: View, shown: np.ndarray | None = None) -> None:
         """Learn a correction that was drawn on the Gaussians that are shown, (N,) bool; by default, on all.
@@ -100,33 +100,31 @@ class Corrections:
             raise NoUsableViewsError(
                 "correction: what was drawn sees no Gaussian; expected something drawn on the scene"
             )
-        self._drawn.append(drawn)
+        self.drawn += (drawn,)
 
     def undo(self) -> bool:
         """Take the last correction back, exactly; return whether there was one."""
-        if self._drawn:
-            self._drawn.pop()
-            return True
-        return False
+        before, self.drawn = self.drawn, self.drawn[:-1]
+        return bool(before)
 
     def labels(self) -> set[int]:
         """Return the classes that were drawn."""
-        return {label for drawn in self._drawn for label in np.unique(drawn.labels).tolist()}
+        return {label for drawn in self.drawn for label in np.unique(drawn.labels).tolist()}
 
     def renumber(self, ids: Mapping[int, int]) -> None:
         """Give some classes other numbers."""
         table = np.arange(MAX_LABEL + 1, dtype=np.int32)
         table[list(ids)] = list(ids.values())
-        self._drawn = [drawn._replace(labels=table[drawn.labels]) for drawn in self._drawn]
+        self.drawn = tuple(drawn._replace(labels=table[drawn.labels]) for drawn in self.drawn)
 
     def apply(self, before: Labelling, names: Mapping[int, str] | None = None) -> Labelling:
         """Combine a labelling of the same scene with the corrections; it stays where none has seen a Gaussian.
 
         `names` are those of classes that only the corrections have.
         """
-        if not self._drawn:
+        if not self.drawn:
             return before
-        ids, drawn_labels, votes, seen = map(np.concatenate, zip(*self._drawn, strict=True))
+        ids, drawn_labels, votes, seen = map(np.concatenate, zip(*self.drawn, strict=True))
         num_classes = max(int(drawn_labels.max()) + 1, len(before.class_names))
         touched, rows = np.unique(ids.astype(np.int64), return_inverse=True)
         weight, order, labels = TRUST * np.bincount(rows, seen), np.argsort(rows, kind="stable"), before.labels.copy()

@@ -3,12 +3,11 @@
 from __future__ import annotations
 
 import threading
-from contextlib import suppress
 
 import numpy as np
 import viser
 
-from gsseg_core.errors import GssegError
+from gsseg_core.errors import explained
 from gsseg_core.raster.backends import make_operator
 from gsseg_core.raster.view_operator import ViewOperator
 from gsseg_core.scene.camera import Camera
@@ -59,8 +58,11 @@ class Frames:
     def _send(self, picture: Picture, rows: int) -> None:
         # A window may be so small that nothing can be seen in it; and viser warns of a browser that has just left. An
         # image for which memory runs out is left out: the next one may be drawn.
-        with suppress(GssegError, UserWarning, MemoryError):
+        try:
             self._draw(picture, rows)
+        except Exception as error:
+            if explained(error) is None and not isinstance(error, UserWarning):
+                raise
 
     def _draw(self, picture: Picture, rows: int) -> None:
         camera, operator = camera_of(self._client, rows), self._operators.get(rows)

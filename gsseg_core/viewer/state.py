@@ -5,7 +5,8 @@ from __future__ import annotations
 import itertools
 import tempfile
 import threading
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -133,20 +134,14 @@ class ViewerState:
         """
         with self.lock:
             before = self.model.labelling.labels
-            self.corrections.add(view, self.model.shown())
-            try:
-                self._relabel(self.granularity)
-            except Exception:
-                self.corrections.undo()
-                raise
+            with self._relabelling():
+                self.corrections.add(view, self.model.shown())
             return int(np.count_nonzero(before != self.model.labelling.labels))
 
     def undo(self) -> bool:
         """Take the last correction back; return whether there was one."""
-        with self.lock:
-            undone = self.corrections.undo()
-            self._relabel(self.granularity)
-        return undone
+        with self._relabelling():
+            return self.corrections.undo()
 
     def replace(self, learnt: Labelling) -> None:
         """Show what a live source has learnt by now, under the same corrections.
@@ -154,7 +149,7 @@ class ViewerState:
         Classes that were added here make room for those that turn up there; one of the same name becomes that class. So
         do classes that were corrected or switched off, where the source was reset and numbers its classes anew.
         """
-        with self.lock:
+        with self._relabelling():
             before, taken, model = self._learnt.class_names, learnt.class_names, self.model
             held = before.keys() & {*self.corrections.labels(), *model.hidden, *model.removed}
             # What had but a number may get a name.
@@ -168,7 +163,6 @@ class ViewerState:
                 model.hidden, model.removed = ({ids.get(k, k) for k in off} for off in (model.hidden, model.removed))
             self.added_names = {ids.get(k, k): name for k, name in added.items() if ids.get(k, k) not in taken}
             self._learnt = learnt
-            self._relabel(self.granularity)
 
     def selection(self, scene_format: str, collision: str | None = None) -> tuple[str, bytes]:
         """Write what is shown in a format of `gsseg_core.scene.scene_writers.SCENE_WRITERS`: a file name and its bytes.
@@ -209,6 +203,19 @@ class ViewerState:
         # Classes that were added are in no tree.
         result = replace(result, tree=tree) if ids is None else result.with_ids(ids)
         return "segmentation.npz", _as_file(result.save, "segmentation.npz")
+
+    @contextmanager
+    def _relabelling(self) -> Iterator[None]:
+        """Change the corrections or what was learnt, and show what follows; where that fails, nothing has changed."""
+        model, drawn = self.model, self.corrections
+        with self.lock:
+            before = drawn.drawn, self._learnt, self.added_names, model.hidden, model.removed
+            try:
+                yield
+                self._relabel(self.granularity)
+            except BaseException:
+                drawn.drawn, self._learnt, self.added_names, model.hidden, model.removed = before
+                raise
 
     def _relabel(self, granularity: float) -> None:
         """Show what follows from the corrections, at a level; all of it, or nothing where memory runs out."""

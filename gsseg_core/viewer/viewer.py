@@ -11,7 +11,7 @@ import numpy as np
 import viser
 
 from gsseg_core.data.view import View
-from gsseg_core.errors import GssegError, SettingsError
+from gsseg_core.errors import SettingsError, explained
 from gsseg_core.scene.camera import Camera
 from gsseg_core.viewer.access import Listener, listen
 from gsseg_core.viewer.clients import AUTO, DRAWN_BY, ClientRenderers
@@ -122,8 +122,10 @@ class Viewer:
                 if update is not None:
                     self.state.replace(update.labelling)
                     self.panel.show_live(f"{update.num_views} views so far")
-            except (GssegError, MemoryError) as error:
-                self.panel.show_live(str(error) or "memory is not enough")
+            except Exception as error:
+                if (what := explained(error)) is None:
+                    raise
+                self.panel.show_live(what)
                 self._closing.wait(1.0)
 
 

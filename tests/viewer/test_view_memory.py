@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+import threading
+import time
+from collections.abc import Callable, Iterator
 from contextlib import closing
 from typing import Any
 from unittest.mock import MagicMock
@@ -20,7 +22,8 @@ from gsseg_core.viewer import server_frames
 from gsseg_core.viewer import state as view_state
 from gsseg_core.viewer.access import listen
 from gsseg_core.viewer.clients import SERVER
-from gsseg_core.viewer.model import ViewModel
+from gsseg_core.viewer.live_source import LiveUpdate
+from gsseg_core.viewer.model import Labelling, ViewModel
 from gsseg_core.viewer.picture import Picture
 from gsseg_core.viewer.viewer import Viewer
 
@@ -39,6 +42,10 @@ def viewer() -> Iterator[Viewer]:
 
 def starved(*_: Any, **__: Any) -> Any:
     raise MemoryError("Unable to allocate 1.35 GiB")
+
+
+def starved_gpu(*_: Any, **__: Any) -> Any:
+    raise type("OutOfMemoryError", (RuntimeError,), {})("CUDA out of memory")  # as PyTorch's own is
 
 
 @pytest.mark.parametrize("step", ["at_level", "cut"])
@@ -62,6 +69,24 @@ def test_a_correction_or_level_that_memory_does_not_suffice_for_changes_nothing_
     assert (probabilities_of(state.objects) != probabilities_of(before)).any() and len(state.corrections) == 1
 
 
+def test_what_cannot_be_taken_back_or_learnt_for_want_of_memory_is_there_as_before(
+    viewer: Viewer, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    state, panel = viewer.state, viewer.panel
+    panel._tool.value, panel._target.value = "a disc", NAMES[2]
+    panel.correct_at(CAMERA, COLUMN, ROW)
+    state.change(lambda model: model.toggle(1))
+    corrected, drawn = state.objects, state.corrections.drawn
+    other = labelled(np.zeros(len(SCENE), np.int32), np.ones((len(SCENE), 1), np.float32), {0: "background"})
+    with monkeypatch.context() as patch:
+        patch.setattr(view_state, "cut", starved)
+        for act in (state.undo, lambda: state.replace(other)):
+            with pytest.raises(MemoryError):
+                act()  # type: ignore[operator]
+            assert state.corrections.drawn is drawn and state.objects is corrected and state.model.hidden == {1}
+    assert state.undo() and not len(state.corrections) and np.array_equal(state.objects.labels, TRUTH)
+
+
 def test_the_viewer_goes_on_showing_after_a_picture_for_which_there_was_no_memory(
     viewer: Viewer, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -74,10 +99,13 @@ def test_the_viewer_goes_on_showing_after_a_picture_for_which_there_was_no_memor
     wait_until(lambda: not viewer.panel._rows[2][0].shown, "the class that was switched off")
 
 
-def test_images_are_drawn_again_after_one_for_which_there_was_no_memory(monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.mark.parametrize("starve", [starved, starved_gpu])
+def test_images_are_drawn_again_after_one_for_which_there_was_no_memory(
+    starve: Callable[..., Any], monkeypatch: pytest.MonkeyPatch
+) -> None:
     client, picture = MagicMock(), Picture(SCENE, {}, np.ones(len(SCENE), bool), np.zeros((len(SCENE), 3), np.uint8))
     drawn: list[int] = []
-    monkeypatch.setattr(server_frames.Frames, "_draw", lambda *of: drawn.append(len(drawn)) or starved())
+    monkeypatch.setattr(server_frames.Frames, "_draw", lambda *of: drawn.append(len(drawn)) or starve())
     frames = server_frames.Frames(client)
     try:
         for _ in range(2):
@@ -88,3 +116,23 @@ def test_images_are_drawn_again_after_one_for_which_there_was_no_memory(monkeypa
         assert frames._thread.is_alive()
     finally:
         frames.close()
+
+
+def test_a_source_is_asked_again_after_a_gpu_had_no_memory() -> None:
+    asked = threading.Event()
+
+    class Source:
+        def wait(self, timeout: float) -> LiveUpdate:
+            if not asked.is_set():
+                asked.set()
+                starved_gpu()
+            time.sleep(0.02)
+            return LiveUpdate(labelled(TRUTH.astype(np.int32), np.eye(4, dtype=np.float32)[TRUTH], dict(NAMES)), 7)
+
+        def close(self) -> None:
+            pass
+
+    unknown = ViewModel(SCENE, Labelling.unknown(len(SCENE)))
+    with closing(Viewer(unknown, source=Source(), listener=listen(port=18520), draw=SERVER)) as viewer:
+        assert viewer.panel._live is not None
+        wait_until(lambda: "7 views so far" in viewer.panel._live.content, "what the source has")  # type: ignore[union-attr]

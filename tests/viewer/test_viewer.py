@@ -242,7 +242,7 @@ def test_a_shift_drag_corrects_what_is_in_the_box(shown: Shown) -> None:
     shown.page.keyboard.up("Shift")
     shown.wait(lambda: len(shown.viewer.state.corrections) == 1, "the correction")
     assert (probabilities_of(shown.viewer.state.objects) != probabilities_of(LEARNT))[TRUTH == 1].any()
-    (drawn,) = shown.viewer.state.corrections._drawn
+    (drawn,) = shown.viewer.state.corrections.drawn
     assert drawn.votes.sum() > 100  # px
 
 
