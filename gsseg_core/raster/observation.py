@@ -142,9 +142,10 @@ class Observation(ABC):
                 f"view '{self.name}': likelihood and rest have shapes {likelihood.shape} and {rest.shape}; "
                 f"expected {self.labels.shape} and {self.classes.shape}"
             )
-        if self.answered is None or not all(map(np.array_equal, self.answered[:2], (likelihood, rest))):
-            self.answered = likelihood.copy(), rest.copy(), self._shares(likelihood, rest)
-        return self.answered[2]
+        known = self.answered  # It may be replaced by another thread.
+        if known is None or not all(map(np.array_equal, known[:2], (likelihood, rest))):
+            known = self.answered = likelihood.copy(), rest.copy(), self._shares(likelihood, rest)
+        return known[2]
 
     @abstractmethod
     def _shares(self, likelihood: np.ndarray, rest: np.ndarray) -> VoteShares: ...

@@ -288,6 +288,23 @@ def test_shares_asked_again_are_the_same_and_those_of_other_codes_are_others(bac
     assert other.log_likelihood == expected.log_likelihood != once.log_likelihood
 
 
+def test_shares_are_those_asked_for_whatever_another_thread_asks_of_the_view_meanwhile(backend):
+    scene, camera = random_view(3)
+    seen = backend.make(scene, camera).observe(random_mask(3))
+    said, rest = np.full(len(seen.labels), 0.5), np.full(len(seen.classes), 0.5)
+    expected, questions = seen.shares(said, rest).log_likelihood, [0.25 * said]
+
+    def answer(self, answered):  # The other thread asks just when this one has its answer.
+        vars(self)["answered"] = answered
+        if questions:
+            self.shares(questions.pop(), rest)
+
+    seen.answered = None
+    asked_twice = property(lambda self: vars(self).get("answered"), answer)
+    seen.__class__ = type("AskedTwice", (type(seen),), {"answered": asked_twice})
+    assert seen.shares(said, rest).log_likelihood == expected and not questions
+
+
 def test_a_pixel_that_nothing_explains_gives_no_share_and_a_finite_likelihood(backend):
     scene, camera = random_view(9)
     seen = backend.make(scene, camera).observe(random_mask(9))

@@ -12,19 +12,19 @@ from gsseg_core.raster.view_renderer import PixelGrid
 
 @pytest.mark.parametrize("background", [True, False])
 @pytest.mark.parametrize("channels", [1, 3, 40])
-def test_the_strongest_class_is_the_largest_of_all_that_are_rendered(backend, channels, background):
+@pytest.mark.parametrize("grid", [PixelGrid(2, 5), PixelGrid(9, 4), PixelGrid(20, 1), PixelGrid(40, 3)])
+def test_the_strongest_class_is_the_largest_of_all_that_are_rendered(backend, channels, background, grid):
     scene, camera = random_view(channels, 150, 37, 21)
     operator, rng = backend.make(scene, camera), np.random.default_rng(channels)
     codes = rng.choice([0, 0.25, 1], (len(scene), channels)).astype(np.float32)
     image, left_over = operator.blend(codes)
     image[..., 0] += left_over if background else 0
-    grid = PixelGrid(2, 5)
     found = operator.strongest(CSRRows.from_dense(codes), channels, background, grid)
     assert found.classes.dtype == np.int32 and found.known.dtype == bool
     np.testing.assert_array_equal(found.classes, image.argmax(axis=2))
     sure = np.abs(image.sum(axis=2) - 0.5) > 1e-5
     np.testing.assert_array_equal(found.known[sure], image.sum(axis=2)[sure] > 0.5)
-    np.testing.assert_allclose(found.on_grid, image[2::5, 2::5], atol=1e-6)
+    np.testing.assert_allclose(found.on_grid, grid.of(image), atol=1e-6)
     assert operator.strongest(CSRRows.from_dense(codes), channels, background).on_grid.shape == (0, 0, channels)
     np.testing.assert_array_equal(found.labels(), np.where(found.known, found.classes, -1))
 

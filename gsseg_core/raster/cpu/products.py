@@ -117,11 +117,12 @@ def strongest(
                 out[top + r, left + c], half[top + r, left + c] = best[b, lane], known[b, lane] > np.float32(0.5)
         for r in range((first - top) % step, min(TILE, tiles.height - top), step):
             for c in range((first - left) % step, min(TILE, tiles.width - left), step):
-                if top + r >= first and left + c >= first:
+                row, column = (top + r - first) // step, (left + c - first) // step
+                if row >= 0 and column >= 0:
                     b, lane = in_block(r, c)
                     for k in columns:
-                        some[(top + r) // step, (left + c) // step, k] = values[slots[k] * TILE + b, lane]
-                    some[(top + r) // step, (left + c) // step, 0] += rays[b, lane] if background else np.float32(0)
+                        some[row, column, k] = values[slots[k] * TILE + b, lane]
+                    some[row, column, 0] += rays[b, lane] if background else np.float32(0)
     return out, half, some, image, left_over
 
 
