@@ -39,10 +39,15 @@ class LearntFrom:
             entries = content["views"].get("reliability", [])
             reliability = {str(e["name"]): float(e["reliability"]) for e in entries if e["reliability"] is not None}
             settings, objects = content.get("settings", {}), None
+            labels, label_map = settings.get("labels", cls.labels), settings.get("label_map")
+            if not isinstance(labels, str) or not isinstance(label_map, str | None):
+                raise TypeError(f"masks are {labels!r}, renamed by {label_map!r}")
             if settings.get("ids") == PER_VIEW:
                 found = content["ids"]["views"].items()
                 objects = {name: {int(i): int(k) for i, k in one["objects"].items()} for name, one in found}
-            return cls(report, reliability, settings.get("labels", cls.labels), settings.get("label_map"), objects)
+                if not all(0 <= n <= MAX_LABEL for ids in objects.values() for n in (*ids, *ids.values())):
+                    raise ValueError("ids or objects that are no labels")
+            return cls(report, reliability, labels, label_map, objects)
         except (KeyError, TypeError, AttributeError, ValueError) as error:
             raise StateFileError(
                 f"{report}: no report of a run ({error}); expected the report.json of `gsseg segment`"

@@ -106,3 +106,19 @@ def test_reliability_is_read_from_a_report(tmp_path: Path) -> None:
         report.write_text(broken)
         with pytest.raises(StateFileError, match=r"report.json: no report of a run .*; expected the report.json of `"):
             LearntFrom.read(report)
+
+
+@pytest.mark.parametrize(
+    "settings",
+    [
+        {"labels": 5}, {"labels": None}, {"label_map": {"1": 2}},
+        *({"ids": "per-view", "objects": ids} for ids in ({"1": -7}, {"99999999": 3}, {"1": 10**30})),
+    ],
+)  # fmt: skip
+def test_a_report_whose_masks_are_no_path_or_whose_objects_are_no_labels_is_refused(
+    tmp_path: Path, settings: dict[str, Any]
+) -> None:
+    report, ids = tmp_path / "report.json", {"views": {"view0": {"objects": settings.pop("objects", {})}}}
+    report.write_text(json.dumps({"views": {}, "settings": settings, "ids": ids}))
+    with pytest.raises(StateFileError, match=r"report.json: no report of a run .*; expected the report.json of `"):
+        LearntFrom.read(report)
