@@ -34,6 +34,15 @@ class LabelWeights(NamedTuple):
     gaussians: np.ndarray  # (P,) int32: indices in the scene, ascending for each label
     weights: np.ndarray  # (P,) float32: in px
 
+    @classmethod
+    def of(
+        cls, classes: np.ndarray, gaussians: np.ndarray, labels: np.ndarray, weights: np.ndarray  # (L,), (P,) each
+    ) -> LabelWeights:  # fmt: skip
+        """Sort pairs, whose Gaussians ascend, by label; their labels are positions in `classes`."""
+        order = np.argsort(labels.astype(np.uint16), kind="stable")  # A radix sort, as they have sixteen bits.
+        start = starts(np.bincount(labels, minlength=len(classes)))
+        return cls(classes, start, gaussians[order], weights[order])
+
 
 class ViewPairs(NamedTuple):
     """The (Gaussian, label) pairs of a view as kernels take them; `Observation` says what the arrays are."""
@@ -99,9 +108,7 @@ class Observation(ABC):
 
     def by_label(self) -> LabelWeights:
         """Sort the pairs and their votes by label."""
-        order = np.argsort(self.labels.astype(np.uint16), kind="stable")  # A radix sort, as they have sixteen bits.
-        start = starts(np.bincount(self.labels, minlength=len(self.classes)))
-        return LabelWeights(self.classes, start, self.ids[self.rows[order]], self.votes()[order])
+        return LabelWeights.of(self.classes, self.ids[self.rows], self.labels, self.votes())
 
     @abstractmethod
     def operator(self, camera: Camera, num_gaussians: int) -> ViewRenderer:

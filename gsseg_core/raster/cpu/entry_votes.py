@@ -1,26 +1,20 @@
-"""Votes of a view straight from the sums of its entries, where no observation of it is needed."""
+"""The pairs of a view and their votes straight from the sums of its entries, where no observation of it is needed."""
 
 from __future__ import annotations
 
 import numba as nb
 import numpy as np
 
-from gsseg_core.data.label_evidence import LabelEvidence
 from gsseg_core.kernels.compiler import kernel
 from gsseg_core.raster.constants import CHUNKS
 from gsseg_core.raster.cpu.lifting import Lifted
 from gsseg_core.raster.cpu.tiling import Tiles
-from gsseg_core.raster.vote_total import PairVotes, VoteTotal
+from gsseg_core.raster.vote_total import PairVotes
 from gsseg_core.simd import AHEAD, prefetch
 
 
-def add_entry_votes(
-    total: VoteTotal, ids: np.ndarray,  # added to; (M,) int32, distinct
-    tiles: Tiles, lifted: Lifted, evidence: LabelEvidence, sign: int,
-) -> None:  # fmt: skip
-    """Add a view's votes to those of others, bit for bit as `raster.observation.Observation.vote` does with pairs."""
-    if not len(lifted.classes):
-        return
+def pair_votes(ids: np.ndarray, tiles: Tiles, lifted: Lifted) -> PairVotes:  # (M,) int32, distinct
+    """List the pairs of a view and their votes, to the last bit as `label_pairs.number_pairs` does."""
     labels = lifted.labels
     count = np.diff(labels.start)
     facts = np.stack([count, lifted.slot_start[:-1] - tiles.start[:-1] * count, labels.start[:-1]], axis=1)
@@ -30,8 +24,7 @@ def add_entry_votes(
     extra = lifted.counts[:, 3].sum() - lifted.counts[:, 0].sum() + 1
     chunks = np.arange(CHUNKS + 1)
     capacity = tiles.gaussian_start[chunks * len(ids) // CHUNKS] + extra * chunks
-    cast = _list_pairs(ids, tiles, facts, packed, lifted.sums, labels.present, len(lifted.classes), capacity)
-    total.add(cast, evidence.votes, sign)
+    return _list_pairs(ids, tiles, facts, packed, lifted.sums, labels.present, len(lifted.classes), capacity)
 
 
 @kernel(parallel=True)

@@ -12,9 +12,8 @@ from gsseg_core.csr_rows import CSRRows, starts
 from gsseg_core.data.label_evidence import LabelEvidence
 from gsseg_core.raster.constants import CHANNELS, CHUNKS
 from gsseg_core.raster.cpu import label_pairs, products
-from gsseg_core.raster.cpu.entry_votes import add_entry_votes
+from gsseg_core.raster.cpu.entry_votes import pair_votes
 from gsseg_core.raster.cpu.grid_blending import render_grid
-from gsseg_core.raster.cpu.label_weights import label_weights
 from gsseg_core.raster.cpu.lifting import Lifted
 from gsseg_core.raster.cpu.objects_alone import TileObjects
 from gsseg_core.raster.cpu.projection import joined, project
@@ -119,12 +118,15 @@ class TileOperator(ViewOperator):
         return TileObservation(self.camera.name, self.ids, self._tiles, Lifted.of(self._tiles, labels, weights))
 
     def _lift(self, labels: np.ndarray) -> LabelWeights:
-        return label_weights(self.ids, self._tiles, Lifted.of(self._tiles, labels))
+        lifted = Lifted.of(self._tiles, labels)
+        *pairs, parts = pair_votes(self.ids, self._tiles, lifted)
+        listed = (joined(values, parts[:, 0], parts[:, 1] - parts[:, 0]) for values in pairs)
+        return LabelWeights.of(lifted.classes, *listed)
 
     def _vote(self, labels: np.ndarray, evidence: LabelEvidence | None, total: VoteTotal, sign: int) -> bool:
         lifted = Lifted.of(self._tiles, labels)
         evidence = evidence or LabelEvidence(lifted.classes)
-        add_entry_votes(total, self.ids, self._tiles, lifted, evidence, sign)
+        total.add(pair_votes(self.ids, self._tiles, lifted), evidence.votes, sign)
         return lifted.sees
 
 
