@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
+from itertools import takewhile
 from typing import Any
 
 import viser
@@ -201,14 +202,16 @@ class Panel:
     # What the viewer tells.
 
     def show_classes(self, rows: Sequence[ClassRow]) -> None:
-        """List the classes; widgets that are right already stay."""
-        listed = [(row.label, row.name) for row in rows]
+        """List the classes; the widgets before the first that is another one stay, for somebody may press them."""
         with self._state.lock:  # Somebody may search them meanwhile.
-            if listed != [(row.label, row.name) for row, _ in self._rows.values()]:
-                for _, button in self._rows.values():
-                    button.remove()
-                with self._list:
-                    self._rows = {row.label: (row, self._add_row(row)) for row in rows}
+            before = [row for row, _ in self._rows.values()]
+            alike = takewhile(lambda pair: pair[0][:2] == pair[1][:2], zip(rows, before, strict=False))  # label, name
+            kept = sum(1 for _ in alike)
+            for gone in before[kept:]:
+                self._rows.pop(gone.label)[1].remove()
+            with self._list:
+                self._rows |= {row.label: (row, self._add_row(row)) for row in rows[kept:]}
+            if kept < len(rows):
                 self._filter()
             for row in rows:
                 known, button = self._rows[row.label]

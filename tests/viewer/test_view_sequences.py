@@ -391,3 +391,18 @@ def test_a_large_scene_is_within_what_a_browser_draws() -> None:
     with closing(Viewer(ViewModel(scene, Labelling.unknown(2)), listener=listen(port=18300), draw=SERVER)) as viewer:
         start = viewer.server.initial_camera
         assert start.far > 2 * np.linalg.norm(scene.means - start.position, axis=1).max()
+
+
+def test_a_class_that_turns_up_leaves_the_buttons_before_it_to_be_pressed() -> None:
+    with closing(Viewer(ViewModel(SCENE, LEARNT), listener=listen(port=18310), draw=SERVER)) as viewer:
+        panel, rows = viewer.panel, viewer.state.seen()[1]
+        spoon = rows[2]._replace(label=K, name="spoon")
+        before = {label: button for label, (_, button) in panel._rows.items()}
+        for listed, stay in (([*rows, spoon], 4), ([*rows[:2], spoon], 2), (rows[1:], 0), (rows, 0), (rows[:1], 1)):
+            panel.show_classes(listed)
+            buttons = {label: button for label, (_, button) in panel._rows.items()}
+            assert [*buttons] == [row.label for row in listed]
+            assert sum(buttons.get(label) is button for label, button in before.items()) == stay
+            orders = [button.order for button in buttons.values()]
+            assert orders == sorted(orders)
+            before = buttons
