@@ -14,7 +14,10 @@ from gsseg_core.simd import AHEAD, prefetch
 
 
 def pair_votes(ids: np.ndarray, tiles: Tiles, lifted: Lifted) -> PairVotes:  # (M,) int32, distinct
-    """List the pairs of a view and their votes, to the last bit as `label_pairs.number_pairs` does."""
+    """List the pairs of a view and their votes, to the last bit as `label_pairs.number_pairs` does.
+
+    Where thousands of labels are in a view, that takes longer than a sort of all sums; of as many as masks have, less.
+    """
     labels = lifted.labels
     count = np.diff(labels.start)
     facts = np.stack([count, lifted.slot_start[:-1] - tiles.start[:-1] * count, labels.start[:-1]], axis=1)

@@ -34,7 +34,7 @@ _ALL_WANTED = np.empty((0, 0), np.bool_)  # pixels that are wanted, where no ima
 class TileOperator(ViewOperator):
     """W of one view, remade tile by tile at every product and never stored.
 
-    Holds only the projected Gaussians and their tiles, about 36 bytes per visible Gaussian and 12 per tile that it
+    Holds only the projected Gaussians and their tiles, about 44 bytes per visible Gaussian and 8 per tile that it
     touches. Results are the same bit for bit whatever the number of threads and the order of the Gaussians, unless two
     of them have the very same geometry and different codes.
     """
@@ -146,7 +146,8 @@ def vote_total(votes: VoteTotal, device: str) -> AbstractContextManager[VoteTota
 class TileObservation(Observation):
     """W of one view, cut down to the Gaussians that its labelled pixels see; remade from them in every product.
 
-    Holds about 65 bytes per Gaussian that is seen, 4 per tile in which it is, and 10 more where a pixel has a weight.
+    Holds 44 bytes per Gaussian that is seen and 16 per pair; 4 per tile in which the Gaussian is, and where a pixel there
+    has a weight, 6 more and 4 for each label of the tile; and of the mask one or two per pixel.
     """
 
     def __init__(self, name: str, ids: np.ndarray, tiles: Tiles, lifted: Lifted) -> None:  # ids (M,)

@@ -36,7 +36,7 @@ _COPIED = 1 << 24  # votes that are copied from the GPU at once
 class GPUOperator(ViewOperator):
     """W of one view on a GPU, remade tile by tile at every product and never stored.
 
-    Arrays go in and come out as on the CPU. What is kept of the view, about 52 bytes per visible Gaussian and 12 per
+    Arrays go in and come out as on the CPU. What is kept of the view, about 44 bytes per visible Gaussian and 12 per
     tile that it touches, lies on the GPU. By the rules of the CPU, and as there, results are the same bit for bit in
     every run and for any order of the Gaussians, unless two of them have the very same geometry and different codes.
     """
