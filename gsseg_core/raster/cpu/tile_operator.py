@@ -146,8 +146,8 @@ def vote_total(votes: VoteTotal, device: str) -> AbstractContextManager[VoteTota
 class TileObservation(Observation):
     """W of one view, cut down to the Gaussians that its labelled pixels see; remade from them in every product.
 
-    Holds 44 bytes per Gaussian that is seen and 16 per pair; 4 per tile in which the Gaussian is, and where a pixel there
-    has a weight, 6 more and 4 for each label of the tile; and of the mask one or two per pixel.
+    Holds 44 bytes per Gaussian that is seen and 16 per pair; 4 per tile in which the Gaussian is, and where a pixel
+    there has a weight, 6 more and 4 for each label of the tile; and of the mask one or two per pixel.
     """
 
     def __init__(self, name: str, ids: np.ndarray, tiles: Tiles, lifted: Lifted) -> None:  # ids (M,)
