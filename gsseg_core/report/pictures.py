@@ -26,6 +26,7 @@ MARGIN = 0.25  # around the object in a thumbnail, as a share of its size
 SMALLEST_CROP_PX = 32
 ENOUGH = THUMBNAIL_PX**2  # pixels of a class that fill its thumbnail: more of them show no more
 CUT = 0.3  # what a view in which the margin cuts an object counts, beside one that shows it whole
+MOST_KEPT = 32  # images that are kept once they were rendered: thumbnails may need hundreds, each once
 UNSEEN = 0.5  # what a view counts whose image would have to be rendered, beside one whose image is at hand
 _AGREE, _DIFFER, _UNKNOWN = (40, 44, 52), (236, 72, 60), FAINT_INK
 
@@ -65,7 +66,8 @@ class ViewImages:
         image = self._images.get((view.name, view.camera.width))
         if image is None:
             image = background_image(self.scene, make_operator(self.scene, view.camera, self.device))
-            self.keep(view, image)
+            if len(self._images) < MOST_KEPT:
+                self.keep(view, image)
         return image
 
 

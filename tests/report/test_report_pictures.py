@@ -92,6 +92,17 @@ def test_views_that_have_to_be_rendered_for_thumbnails_are_so_at_once(monkeypatc
     assert {k: name for k, (name, _) in found.items()} == {1: "1", 2: "2"}
 
 
+def test_of_views_without_photos_no_more_images_are_kept_than_a_page_shows_of_whole_views(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(pictures, "MOST_KEPT", 2)
+    views = [view_of(str(k), painted((k, slice(10, 20), slice(10, 20)))) for k in range(1, 6)]
+    checks, images = [compare_mask(view, view.read_labels(), 6) for view in views], ViewImages(SCENE)
+    checked = MaskChecks(checks, {view.name: view for view in views}, True)
+    assert len(thumbnails(range(1, 6), checked, images, palette(6))) == 5
+    assert 1 <= sum(map(images.at_hand, views)) <= 3  # Two threads may each keep the last one.
+
+
 def test_thumbnails_of_large_views_have_no_holes_where_nothing_was_compared() -> None:
     labels = np.zeros((480, 640), np.int32)
     labels[100:300, 200:400] = 1
