@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 import shutil
 from pathlib import Path
 
@@ -13,7 +14,9 @@ from segmented_place import assert_one_line, segment
 from small_scenes import NAMES
 
 from gsseg_core.cli.main import main
+from gsseg_core.data.dataset import Dataset
 from gsseg_core.data.label_images import read_mask, write_mask
+from gsseg_core.errors import MaskFormatError
 
 
 def masks_of(place: Path, writer: mask_writers.Writer, factor: int = 1) -> Path:
@@ -39,6 +42,21 @@ def test_masks_of_another_program_give_the_labels_of_the_same_label_images(
     np.testing.assert_array_equal(labels_of(place), expected)
     assert f"masks: {name.split()[0]}, ids global, 6 views\n" in capsys.readouterr().out
     assert json.loads((place / "out/report.json").read_text())["masks"]["format"] == name.split()[0]
+
+
+@pytest.mark.parametrize("name", ["COCO polygons", "LabelMe polygons", "ISAT", "Grounded SAM 2"])
+def test_sizes_of_images_may_be_written_as_floats_but_not_with_a_fraction(place: Path, name: str) -> None:
+    masks = masks_of(place, mask_writers.WRITERS[name])
+    files = sorted(masks.glob("*.json")) if masks.is_dir() else [masks]
+    for end in (".0", ".5"):
+        for path in files:
+            path.write_text(re.sub(r'(?i)((?:width|height)": \d+)(\.\d)?', rf"\g<1>{end}", path.read_text()))
+        assert f": 64{end}" in files[0].read_text()
+        if end == ".0":
+            found = Dataset(place / "data", masks).views()[0].read_labels()
+            np.testing.assert_array_equal(found > 0, read_mask(place / "data/labels/view0.png").labels > 0)
+    with pytest.raises(MaskFormatError, match=r"is (64|48)\.5; expected a whole number of pixels"):
+        Dataset(place / "data", masks)
 
 
 def test_automatic_masks_are_taken_with_ids_of_their_own_view_and_that_is_said(

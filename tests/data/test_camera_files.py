@@ -108,6 +108,11 @@ def test_poses_of_three_rows_and_lenses_without_distortion_are_accepted(tmp_path
     assert_lands(read_cameras(tmp_path)[0], 55, 35)
 
 
+def test_a_camera_model_that_is_null_is_none_that_bends(tmp_path: Path) -> None:
+    (tmp_path / "transforms.json").write_text(json.dumps(transforms() | {"camera_model": None}))
+    assert_lands(read_cameras(tmp_path)[0], 55, 35)
+
+
 def test_the_last_row_of_a_nerfstudio_pose_may_be_rounded(tmp_path: Path) -> None:
     content = transforms()
     content["frames"][0]["transform_matrix"][3] = [0.0, 0.0, 1e-17, 1.0000000000000002]

@@ -149,6 +149,18 @@ def test_of_isat_the_higher_layer_is_on_top(tmp_path: Path) -> None:
     assert (labels == 2).sum() == 9 and (labels == 1).sum() == 27
 
 
+def test_of_grounded_sam_the_smaller_mask_is_on_top_whatever_their_order(tmp_path: Path) -> None:
+    sizes = {"cup": 3, "table": 6, "on it": 2}
+    masks = {name: np.pad(np.ones((n, n), bool), ((0, HEIGHT - n), (0, WIDTH - n))) for name, n in sizes.items()}
+    annotations = [
+        {"class_name": name, "segmentation": {"size": [HEIGHT, WIDTH], "counts": mask_writers.runs(mask)}}
+        for name, mask in masks.items()
+    ]
+    whole = {"annotations": annotations, "img_width": WIDTH, "img_height": HEIGHT}
+    labels = one_view(tmp_path, "frame_001.json", whole)
+    assert [(labels == k).sum() for k in (1, 2, 3)] == [5, 4, 27]
+
+
 def test_of_cvat_the_higher_z_order_is_on_top(tmp_path: Path) -> None:
     make_cameras(tmp_path)
     polygon = '<polygon label="{}" points="0,0;{},0;{},{};0,{}" z_order="{}"/>'
@@ -296,6 +308,7 @@ def test_an_image_that_is_listed_without_an_annotation_has_no_mask(tmp_path: Pat
     ("name", "view"),
     [
         ("a.png", "a"), ("a.jpg.png", "a"), ("a_mask.png", "a"), ("a_labels.json", "a"), ("a.jpg.json", "a"),
+        ("mask_a.json", "a"),
         ("images/a.JPG", "a"), ("C:\\x\\a.jpg", "a"), ("a_jpg.rf.0123abcd.jpg", "a"), ("a.jpg_mask.png", "a"),
         ("upload/1/0123abcd-a.jpg", "a"), ("images/left/1.JPG.png", "left_1"), ("left/x/1.png", None),
         ("a.b.png", "a.b"), ("a_mask_mask.png", None), ("ab.png", None), ("a.c.png", None), ("../a.png", "a"),

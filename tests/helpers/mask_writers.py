@@ -176,6 +176,21 @@ def isat(folder: Path, labels: Labels, names: Names) -> Path:
     return folder
 
 
+def grounded_sam(folder: Path, labels: Labels, names: Names) -> Path:
+    for stem, image in labels.items():
+        height, width = image.shape
+        annotations = [
+            {
+                "class_name": names[k], "bbox": [0.0, 0.0, 1.0, 1.0], "score": [0.5],
+                "segmentation": {"size": [height, width], "counts": compressed(runs(image == k))},
+            }
+            for k in objects(image)
+        ]  # fmt: skip
+        whole = {"image_path": f"images/{stem}.jpg", "annotations": annotations, "box_format": "xyxy"}
+        (folder / f"{stem}.json").write_text(json.dumps(whole | {"img_width": width, "img_height": height}))
+    return folder
+
+
 def cvat(folder: Path, labels: Labels, names: Names, as_masks: bool = False) -> Path:
     lines = [
         '<?xml version="1.0" encoding="utf-8"?>',
@@ -262,7 +277,7 @@ WRITERS: dict[str, Writer] = {
     "COCO polygons": coco, "COCO runs": coco_runs, "COCO text": coco_text, "SAM 2 video": sam2_video,
     "LabelMe polygons": labelme, "LabelMe masks": labelme_masks, "ISAT": isat, "CVAT polygons": cvat,
     "CVAT masks": cvat_masks, "YOLO": yolo, "EISeg images": eiseg, "EISeg polygons": eiseg_polygons,
-    "Gaussian Grouping": object_masks, "SAM 2 palette": palette_images,
+    "Gaussian Grouping": object_masks, "SAM 2 palette": palette_images, "Grounded SAM 2": grounded_sam,
 }  # fmt: skip
 PER_VIEW_WRITERS: dict[str, Writer] = {"SAM JSON": sam_json, "SAM folders": sam_folders}
 NAMELESS = ("SAM 2 video", "Gaussian Grouping", "SAM 2 palette")

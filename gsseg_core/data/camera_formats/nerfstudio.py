@@ -36,7 +36,7 @@ def read_nerfstudio(path: Path, within: Path | None) -> list[Camera]:
 
 def _intrinsics(entry: Entry) -> Intrinsics:
     """Read the lens of a frame; as in nerfstudio, a camera model without distortion may have it all the same."""
-    where, name = entry.where, str(entry.fields.get("camera_model", "OPENCV")).upper()
+    where, name = entry.where, str(entry.fields.get("camera_model") or "OPENCV").upper()
     model = MODELS_BY_NAME.get("OPENCV_FISHEYE" if entry.fields.get("is_fisheye") else name, _BROWN)
     if name not in MODELS_BY_NAME and name != "PERSPECTIVE":
         known = ", ".join(MODELS_BY_NAME)

@@ -18,8 +18,8 @@ SUPERVISES = "supervises.json"
 
 _SUFFIXES = IMAGE_SUFFIXES | {".json", ".npz", ".txt", ".xml"}
 _MARK = re.compile(r"[_.-](?:masks?|labels?|seg|segmentation)$", re.IGNORECASE)
-_RENAMED = re.compile(  # by Roboflow, by Label Studio
-    r"_(?:bmp|jpe?g|png|tiff?|webp)\.rf\.[0-9a-f]+$|^[0-9a-f]{8}-", re.IGNORECASE
+_RENAMED = re.compile(  # by Roboflow, by Label Studio, by Grounded SAM 2
+    r"_(?:bmp|jpe?g|png|tiff?|webp)\.rf\.[0-9a-f]+$|^[0-9a-f]{8}-|^masks?[_-]", re.IGNORECASE
 )
 _FOLDERS = 4  # above a file that may be part of its view's name
 _PEEKED = 4096
@@ -28,8 +28,8 @@ _PEEKED = 4096
 def view_of(name: str, stems: Collection[str]) -> str | None:
     """Find the view that a file of masks belongs to, by its name; None if there is none.
 
-    `frame_1.png`, `frame_1.jpg.png`, `frame_1_mask.png`, `images/frame_1.jpg` and the like all belong to `frame_1`,
-    and `left/1.png` to `left_1`, unless there is a view that is closer to the name.
+    `frame_1.png`, `frame_1.jpg.png`, `frame_1_mask.png`, `mask_frame_1.png`, `images/frame_1.jpg` and the like all
+    belong to `frame_1`, and `left/1.png` to `left_1`, unless there is a view that is closer to the name.
     """
     candidates = possible_stems(name)
     for _ in range(4):

@@ -73,10 +73,10 @@ class Record:
         sizes = []
         for key in (width, height):
             value = self.value(key)
-            if type(value) is not int or value < 1:
+            if type(value) not in (int, float) or value < 1 or value % 1:  # What came through a table has 32.0.
                 found = clipped(value) if type(value) in (int, float) else kind_of(value)
                 raise MaskFormatError(f"{self.where}: '{key}' is {found}; expected a whole number of pixels")
-            sizes.append(value)
+            sizes.append(int(value))
         check_pixels(sizes[0], sizes[1], self.where, MaskFormatError)
         return sizes[0], sizes[1]
 

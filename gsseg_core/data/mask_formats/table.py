@@ -16,6 +16,7 @@ from gsseg_core.data.mask_files import CLASS_ID, DETECTIONS, mask_files
 from gsseg_core.data.mask_formats.coco import is_coco, read_coco
 from gsseg_core.data.mask_formats.cvat import is_cvat, read_cvat
 from gsseg_core.data.mask_formats.eiseg import is_eiseg, read_eiseg
+from gsseg_core.data.mask_formats.grounded_sam import is_grounded_sam, read_grounded_sam
 from gsseg_core.data.mask_formats.isat import is_isat, read_isat
 from gsseg_core.data.mask_formats.labelme import is_labelme, read_labelme
 from gsseg_core.data.mask_formats.masks import MaskSet
@@ -73,6 +74,10 @@ MASK_FORMATS = [
         "from 1, names from A to Z", "the higher `layer`",
     ),
     MaskFormat(
+        "Grounded SAM 2", is_grounded_sam, read_grounded_sam, "`<stem>.json` with `annotations` and `img_width`",
+        "from 1, names from A to Z", "the smaller mask",
+    ),
+    MaskFormat(
         "CVAT", is_cvat, read_cvat, "an XML file of CVAT for images 1.1",
         "from 1, in the order of the task's labels", "the higher `z_order`",
     ),
@@ -109,7 +114,10 @@ def open_masks(path: Path, stems: Iterable[str], within: Path | None = None) -> 
                 "or a folder without the others"
             )
         if not found and (unknown := _unknown(place)):
-            raise MaskFormatError(f"{unknown}: is no file of masks that is known; gsseg reads {known_formats()}")
+            first = next(iter(place.sample[1]), None) if isinstance(place.sample[1], list) else None
+            is_studio = isinstance(first, dict) and {"annotations", "data"} <= first.keys()
+            hint = ", but Label Studio's own: export it as COCO" if is_studio else ""
+            raise MaskFormatError(f"{unknown}: is no file of masks that is known{hint}; gsseg reads {known_formats()}")
         masks = found[0].read(place) if found else None
     except RecursionError as cause:
         raise MaskFormatError(f"{path}: is nested too deep; expected masks") from cause
