@@ -93,7 +93,7 @@ def segment_summary(report: Mapping[str, Any], out: str) -> str:
     if worst and views["used"] > 1:
         used += f"\nmasks that agree least with the other views: {worst}"
     if masks := report.get("masks"):
-        used = f"{_masks_line(masks)}\n{used}"
+        used = f"masks: {masks_line(masks)}\n{used}"
     return f"""{table(["class", "Gaussians", "confidence"], classes)}
 
 {used}
@@ -115,10 +115,10 @@ def _memory_line(prepared: Mapping[str, int]) -> str:
     return f"prepared views: {in_memory} in memory (at most {budget}), {in_file} in a temporary file"
 
 
-def _masks_line(masks: Mapping[str, Any]) -> str:
+def masks_line(masks: Mapping[str, Any]) -> str:
     """Write what a report says of masks that another program wrote, or that were scaled."""
     scaled = f"; scaled by nearest pixel, {masks['scaled']}" if "scaled" in masks else ""
-    return f"masks: {masks['format']}, ids {masks['ids']}, {counted(masks['views'], 'view')}{scaled}"
+    return f"{masks['format']}, ids {masks['ids']}, {counted(masks['views'], 'view')}{scaled}"
 
 
 def evaluation_summary(scores: Mapping[str, Any]) -> str:

@@ -20,7 +20,7 @@ from importlib import metadata
 from itertools import groupby
 from pathlib import Path
 
-from gsseg_core.cli.shared import add_dataparser, add_device, add_quiet, load_kernels, placed
+from gsseg_core.cli.shared import LABELS, add_dataparser, add_device, add_quiet, labels_path, load_kernels, placed
 from gsseg_core.cli.terminal import note, tell
 from gsseg_core.errors import GssegError, SettingsError
 from gsseg_core.kernels import kernel_cache
@@ -78,8 +78,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     what = "a scene, to print its format; or a dataset, to read it, and with --scene to see whether its cameras fit"
     parser.add_argument("path", nargs="?", metavar="PATH", help=what)
     parser.add_argument("--scene", metavar="SCENE", help="trained scene that cameras of the dataset PATH should fit")
-    labels = "the dataset's folder of masks; with --scene, they count where there are no photos (default: labels)"
-    parser.add_argument("--labels", default="labels", metavar="DIR", help=labels)
+    labels = "the masks, as for gsseg segment; with --scene, they count where there are no photos (default: labels)"
+    parser.add_argument("--labels", default=LABELS, metavar="PATH", help=labels)
     add_dataparser(parser)
     add_device(parser)
     add_quiet(parser)
@@ -91,6 +91,8 @@ def run(options: argparse.Namespace) -> int:
         raise SettingsError(
             "gsseg doctor: --scene is given alone; expected a dataset, too, whose cameras are to fit it"
         )
+    if options.path:
+        options.labels = labels_path(options.path, options.labels)
     if options.scene:
         return _examine_frame(options)
     if options.path:
@@ -150,7 +152,8 @@ def examine_dataset(path: str, labels: str) -> list[Finding]:
     """
     from gsseg_core.data.camera_files import find_cameras
     from gsseg_core.data.dataset import Dataset
-    from gsseg_core.text import clipped, counted
+    from gsseg_core.data.hints import mask_hint
+    from gsseg_core.text import clipped, counted, masks_line
 
     found = find_cameras(Path(path)) if os.path.isdir(path) else None
     if found is None:
@@ -160,11 +163,17 @@ def examine_dataset(path: str, labels: str) -> list[Finding]:
     for view in masked:
         view.read_seen()
     train, test = (len(dataset.views(split)) for split in ("train", "test"))
-    mark, fix = ("ok", "") if masked else ("-", "gsseg segment takes their place by --labels PATH")
-    told = f"of {counted(len(masked), 'view')}; all can be read" if masked else f"none in {clipped(labels)}"
+    rest = len(dataset.views()) - train - test
+    unused = f", {rest} for neither: split.json names them nowhere, or not as train or test" if rest else ""
+    told, mark, fix = f"of {counted(len(masked), 'view')}; all can be read", "ok", ""
+    if not masked:
+        hint = mask_hint(Path(path), labels, [view.camera.image for view in dataset.views()])
+        told, mark, fix = f"none in {clipped(labels)}", "-", hint.removeprefix("; ")
+    described = dataset.describe_masks()
     return [
-        Finding(name, "cameras", f"{found[0].name}: {train} to learn from, {test} to test"),
+        Finding(name, "cameras", f"{found[0].name}: {train} to learn from, {test} to test{unused}"),
         Finding(name, "masks", told, mark, fix),
+        *([Finding(name, "format", masks_line(described), "")] if described else []),
         Finding(name, "scene", "not looked at", "", f"gsseg doctor {name} --scene SCENE tells whether cameras fit"),
     ]
 

@@ -24,7 +24,6 @@ EXAMPLES = """
   gsseg segment scene.ply --data DATASET --out out --learner votes --views 20
   gsseg segment scene.ply --data DATASET --out out --format usd --collision
 """
-_OWN_IDS = "where an id holds in its own view only, as SAM's do, it takes --ids per-view"
 _HALF = 0.5  # share of its pixels in which half of the masks agree less with the others, whatever their errors
 
 
@@ -73,7 +72,6 @@ def run(options: argparse.Namespace) -> int:
     """Segment, and print a summary."""
     # The rasteriser's kernels load with the pipeline; `gsseg --help` need not wait for them.
     from gsseg_core import pipeline
-    from gsseg_core.errors import UnknownLabelError
 
     outer = None if options.no_filter else options.refine
     refine = RefineSettings(
@@ -81,19 +79,16 @@ def run(options: argparse.Namespace) -> int:
         filter=outer == "paper", carve=outer == "carve",
     )  # fmt: skip
     load_kernels(options.quiet, options.device)
-    try:
-        with progress_bars(options.quiet) as progress:
-            report = pipeline.segment(
-                options.scene, options.data, options.out, labels=labels_path(options), learner=options.learner,
-                views=options.views, refine=refine, graph=not options.no_graph, device=options.device,
-                memory_budget=None if options.memory_budget is None else options.memory_budget << 20,
-                seed=options.seed, scheduler=options.scheduler, ids=options.ids, granularity=options.granularity,
-                label_map=options.label_map,
-                scene_format=options.format, collision=options.collision, align=options.align,
-                dataparser=options.dataparser, quality=options.quality, progress=progress,
-            )  # fmt: skip
-    except UnknownLabelError as error:
-        raise UnknownLabelError(f"{error}{'' if options.ids else f'; {_OWN_IDS}'}") from error
+    with progress_bars(options.quiet) as progress:
+        report = pipeline.segment(
+            options.scene, options.data, options.out, labels=labels_path(options.data, options.labels),
+            learner=options.learner, views=options.views, refine=refine, graph=not options.no_graph,
+            device=options.device, memory_budget=None if options.memory_budget is None else options.memory_budget << 20,
+            seed=options.seed, scheduler=options.scheduler, ids=options.ids, granularity=options.granularity,
+            label_map=options.label_map,
+            scene_format=options.format, collision=options.collision, align=options.align,
+            dataparser=options.dataparser, quality=options.quality, progress=progress,
+        )  # fmt: skip
     from gsseg_core.text import segment_summary
 
     _note_doubts(options, report)
@@ -103,11 +98,12 @@ def run(options: argparse.Namespace) -> int:
 
 def _note_doubts(options: argparse.Namespace, report: dict[str, Any]) -> None:
     """Warn of what makes a whole run worthless."""
+    from gsseg_core.data.label_images import OWN_IDS
     from gsseg_core.report.findings import NO_OBJECTS, has_objects, renamed_ids_of
 
     known = [view["reliability"] for view in report["views"].get("reliability", ()) if view["reliability"] is not None]
     if known and median(known) < _HALF and report["settings"]["ids"] == "global":
-        note(f"most masks contradict the others: {_OWN_IDS}")
+        note(f"most masks contradict the others: {OWN_IDS}")
     elif renamed := renamed_ids_of(report):
         note(renamed)
     agreement = report["frame"]["agreement"]

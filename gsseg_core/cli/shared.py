@@ -67,10 +67,9 @@ def add_collision(add: Callable[..., object], what: str) -> None:
     add("--collision", nargs="?", choices=("hull", "surface", "poisson"), const="hull", help=mesh)
 
 
-def labels_path(options: argparse.Namespace) -> str:
+def labels_path(data: str, labels: str) -> str:
     """Return the place of the masks: in the dataset, or else, where that lacks it, as a shell completes it."""
-    labels: str = options.labels
-    is_elsewhere = not os.path.exists(os.path.join(options.data, labels)) and os.path.exists(labels)
+    is_elsewhere = not os.path.exists(os.path.join(data, labels)) and os.path.exists(labels)
     # The default is a folder of the dataset only: masks that lie here by chance were not asked for.
     return os.path.abspath(labels) if is_elsewhere and labels != LABELS else labels
 

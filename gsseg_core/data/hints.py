@@ -72,7 +72,11 @@ def mask_hint(root: Path, labels: str, stems: Collection[str]) -> str:
         return f"{looked}, but {wrong}: make one for each view, {labels}/{stem}/<class id>.png ({_MORE})"
     others = [path for path in (*_folders(root), *_annotations(root)) if path != root / labels]
     counts = [(len(_masks(mask_files, path, stems)) or _count_foreign(path, stems), path) for path in others]
-    count, place = max(counts, key=lambda found: found[0], default=(0, root))
+    # A folder that was named may be one too high; what lies beside it is perhaps something else, as true masks are.
+    below = (root / labels).resolve()
+    count, place = max(
+        counts, key=lambda found: (found[0] > 0 and below in found[1].resolve().parents, found[0]), default=(0, root)
+    )
     if count:
         if (more := len(_masks(masks_below, place.parent, stems))) > count and place.parent != root:
             count, place = more, place.parent

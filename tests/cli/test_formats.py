@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from mask_writers import sam_json
 from scene_files import some_scene, write_glb, write_gsplat, write_spz
 from small_scenes import NAMES, NUM_CLASSES, balls_on_a_table, clean_views, taught, write_dataset
 
@@ -87,6 +88,26 @@ def test_doctor_says_of_a_scene_its_format_and_what_of_it_is_lost(
     assert "scan.spz: header: 4 bytes are there" in capsys.readouterr().err
 
 
+def test_doctor_says_where_masks_are_what_their_ids_are_and_which_views_are_of_no_split(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    root = write_dataset(tmp_path / "data")
+    (root / "split.json").write_text('{"train": ["view0", "view1"], "val": ["view2"], "test": ["view3"]}')
+    (root / "labels").rename(root / "true")
+    sam_json(root, {"view0": np.ones((96, 128), np.int32)}, {})
+    (tmp_path / "sam").mkdir()
+    (root / "view0.json").rename(tmp_path / "sam/view0.json")
+    assert main(["doctor", str(root)]) == 0
+    told = capsys.readouterr().out
+    assert "2 to learn from, 1 to test, 3 for neither" in told
+    assert "none in labels" in told and "found 6 masks of these names in true/: type --labels true" in told
+    monkeypatch.chdir(tmp_path)
+    assert main(["doctor", str(root), "--labels", "sam"]) == 0  # as a shell completes it
+    assert "SAM JSON, ids per-view, 1 view" in capsys.readouterr().out
+    (root / "classes.json").write_text('{"0": "background", "1": "a"}')
+    assert main(["doctor", str(root), "--labels", "true"]) == 2 and "takes --ids per-view" in capsys.readouterr().err
+
+
 def test_doctor_reads_all_masks_of_a_dataset_and_says_that_it_looked_at_no_scene(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -95,6 +116,7 @@ def test_doctor_reads_all_masks_of_a_dataset_and_says_that_it_looked_at_no_scene
     told = capsys.readouterr().out
     assert "3DGS: 4 to learn from, 2 to test" in told and "of 6 views; all can be read" in told
     assert "scene    not looked at" in told and f"gsseg doctor {root} --scene SCENE" in told
+    assert "neither" not in told and "format" not in told
     mask = root / "labels/view3.png"
     mask.write_bytes(mask.read_bytes()[:-30])
     assert main(["doctor", str(root)]) == 2

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import errno
+import json
 import shlex
 import shutil
 from collections.abc import Callable
@@ -162,6 +163,33 @@ def test_soft_masks_in_a_folder_of_another_name_are_found_as_plain_ones_are(
     assert all(view.has_mask for view in Dataset(data, "soft").views("train"))
 
 
+def test_masks_below_the_folder_that_was_named_come_before_those_beside_it(
+    data: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (data / "yolo/labels").mkdir(parents=True)
+    (data / "labels").rename(data / "true")
+    for path in sorted((data / "true").iterdir())[:-1]:
+        (data / f"yolo/labels/{path.stem}.txt").write_text("0 0 0 0.5 0 0.5 1 0 1\n")
+    assert typed(error_of(capsys, data, "--labels", "yolo"), "--labels") == ["yolo/labels"]
+    assert typed(error_of(capsys, data), "--labels") == ["true"]
+
+
+def test_a_folder_of_a_view_without_images_of_classes_says_what_is_there(
+    data: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (data / "labels/view0.png").rename(data / "mask.png")
+    (data / "labels/view0").mkdir()
+    for name in ("mask.jpg", "mask.json"):
+        (data / "labels/view0" / name).touch()
+    assert "labels/view0: holds no detections, but mask.jpg, mask.json; expected" in error_of(capsys, data)
+
+
+def test_label_studios_own_file_is_told_from_what_it_exports(data: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    (data / "project.json").write_text(json.dumps([{"id": 1, "annotations": [], "data": {"image": "a.jpg"}}]))
+    error = error_of(capsys, data, "--labels", "project.json")
+    assert "no file of masks that is known, but Label Studio's own: export it as COCO; gsseg reads" in error
+
+
 def test_photos_in_the_place_of_masks_are_refused_as_photos(data: Path, capsys: pytest.CaptureFixture[str]) -> None:
     photos(data)
     error = error_of(capsys, data, "--labels", "images")
@@ -227,6 +255,7 @@ def test_a_folder_in_the_place_of_a_scene_leads_to_the_ply_of_most_steps(
     for steps in (7000, 30000):
         (data / f"model/point_cloud/iteration_{steps}").mkdir(parents=True)
         shutil.copy(data / "scene.ply", data / f"model/point_cloud/iteration_{steps}/point_cloud.ply")
+    (data / "model/input.ply").write_text("ply\n")  # COLMAP's points, which the trainer copies
     error = error_of(capsys, data, scene="model")
     assert error.endswith(f"; type {data}/model/point_cloud/iteration_30000/point_cloud.ply")
     assert error_of(capsys, data, scene="scen.ply").endswith(f"found scene.ply in {data}")
