@@ -23,6 +23,7 @@ from gsseg_core.files.limits import MAX_LABEL
 from gsseg_core.files.run_folder import settle
 from gsseg_core.scene.camera import Camera
 
+_SOME_VIEWS = "; to score a few views, name them as test in split.json, and render these"
 BOUNDARY_SHARE = 0.02  # of the image diagonal: width of the boundary band (Cheng et al., Boundary IoU, CVPR 2021)
 
 
@@ -126,6 +127,16 @@ class Evaluation:
         """Mean of `boundary_iou` over the classes that occur in the truth or in the prediction."""
         return _mean(self.boundary_iou)
 
+    @property
+    def other_ids(self) -> dict[int, int]:
+        """Id that predictions give most of a true object, where that is another object's; none if most ids agree."""
+        most: dict[int, tuple[int, int]] = {}
+        for (truth, found), count in self._pairs.items():
+            if truth:
+                most[truth] = max(most.get(truth, (0, 0)), (count, found))
+        others = {k: found for k, (_, found) in sorted(most.items()) if found not in (0, k)}
+        return others if 2 * len(others) > len(most) else {}
+
     def as_dict(self, class_names: Mapping[int, str] | None = None) -> dict[str, Any]:
         """Everything as plain numbers for JSON; what is undefined is None.
 
@@ -194,7 +205,7 @@ def evaluate_folders(pred_dir: str | Path, truth_dir: str | Path, cameras: Itera
     if missing:
         raise MaskFormatError(
             f"{truth_dir}: found no {missing[0]} ({len(missing)} of {len(predictions)} are missing); "
-            f"expected a true mask for every prediction in {pred_dir}"
+            f"expected a true mask for every prediction in {pred_dir}{_SOME_VIEWS}"
         )
     evaluation = Evaluation()
     for path, image in zip(predictions, images, strict=True):
@@ -218,7 +229,9 @@ def evaluate_masks(pred_dir: str | Path, masks: MaskSet, cameras: Iterable[Camer
         height, width = labels.shape
         camera = known.get(path.stem) or Camera(path.stem, width, height, np.eye(3), np.eye(4))
         if camera.image not in masks.views:
-            raise MaskFormatError(f"{path}: has no true mask among those of {masks.format}; expected one for each view")
+            raise MaskFormatError(
+                f"{path}: has no true mask among those of {masks.format}; expected one for each view{_SOME_VIEWS}"
+            )
         evaluation.add(View(camera, foreign_mask=masks.views[camera.image]).read_labels(), labels, name=str(path))
     return evaluation
 

@@ -21,6 +21,22 @@ def test_large_labels_are_paired_as_they_are() -> None:
     assert evaluation._pairs == {(60000, 60000): 16}
 
 
+def test_ids_that_differ_from_the_true_ones_are_found_where_most_do() -> None:
+    truth = np.repeat([0, 1, 2, 3], 10).reshape(4, 10)
+    for found, others in (
+        ((0, 3, 1, 2), {1: 3, 2: 1, 3: 2}),
+        ((0, 3, 2, 1), {1: 3, 3: 1}),
+        ((0, 1, 3, 2), {2: 3, 3: 2}),
+    ):
+        evaluation = Evaluation()
+        evaluation.add(truth, np.array(found)[truth])
+        assert evaluation.other_ids == others
+    for found in ((0, 1, 2, 3), (0, 1, 2, 2), (0, 0, 0, 0), (2, 0, 2, 3)):  # Right, one swallowed, nothing found.
+        evaluation = Evaluation()
+        evaluation.add(truth, np.array(found)[truth])
+        assert evaluation.other_ids == {}
+
+
 def make_views(seed: int, num_views: int = 3, num_classes: int = 7) -> list[tuple[np.ndarray, np.ndarray]]:
     """Patchy label maps of several sizes; the prediction is the truth, moved, with some pixels wrong."""
     rng = np.random.default_rng(seed)

@@ -6,7 +6,7 @@ import argparse
 from contextlib import suppress
 from pathlib import Path
 
-from gsseg_core.cli.terminal import tell
+from gsseg_core.cli.terminal import note, tell
 
 DESCRIPTION = """
 Scores predicted label maps against true ones of the same names: IoU, accuracy and boundary IoU of each class, and
@@ -49,16 +49,23 @@ def run(options: argparse.Namespace) -> int:
     images = [camera.image for camera in cameras] or [path.stem for path in predicted_maps(options.pred)]
     masks = open_masks(Path(options.truth), images)
     if masks is None:
-        scores = evaluate_folders(options.pred, options.truth, cameras).as_dict(names)
+        evaluation = evaluate_folders(options.pred, options.truth, cameras)
     elif masks.per_view:
         raise SettingsError(
             f"{options.truth}: is of {masks.format}, whose ids hold in their own view only; expected true masks with "
             "ids that mean the same in every view"
         )
     else:
-        scores = evaluate_masks(options.pred, masks, cameras).as_dict(masks.class_names or names)
+        evaluation = evaluate_masks(options.pred, masks, cameras)
+    scores = evaluation.as_dict((masks and masks.class_names) or names)
     if options.json:
         write_json(options.json, scores)
+    if others := evaluation.other_ids:
+        listed = ", ".join(f"{k} is {found}" for k, found in list(others.items())[:3])
+        note(
+            f"most true objects have another id in {options.pred} (true {listed}): ids are compared as they are; "
+            "objects that were found, as by --ids per-view, have numbers of their own, and no score here"
+        )
     tell(evaluation_summary(scores))
     return 0
 

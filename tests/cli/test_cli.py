@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import re
+import shutil
 import subprocess
 import sys
 import weakref
@@ -83,6 +84,20 @@ def test_render_and_eval_score_the_views_that_were_not_learnt_from(
     assert f"{100 * told['mean_iou']:.1f} %" in capsys.readouterr().out
     assert main([*render, "--split", "all"]) == 0
     assert len(list((place / "maps").glob("*.png"))) == 6
+
+
+def test_eval_says_that_ids_are_others_than_the_true_ones(place: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    shutil.copytree(place / "data/labels", place / "found")
+    scores = ["eval", "--pred", f"{place}/found", "--truth", f"{place}/data/labels"]
+    assert main(scores) == 0 and capsys.readouterr().err == ""
+    for path in (place / "found").iterdir():
+        labels = read_mask(path).labels
+        write_mask(path, np.where(labels > 0, labels % 3 + 1, labels), 8)
+    assert main(scores) == 0
+    told = capsys.readouterr()
+    assert "(true 1 is 2, 2 is 3, 3 is 1): ids are compared as they are" in told.err and "mean" in told.out
+    (place / "data/labels/view0.png").unlink()
+    assert main(scores) == 2 and "name them as test in split.json" in capsys.readouterr().err
 
 
 def test_a_view_called_like_the_legend_keeps_its_overlay(place: Path) -> None:
