@@ -9,6 +9,7 @@ import numpy as np
 
 from gsseg_core.csr_rows import CSRRows
 from gsseg_core.data.object_tree import ObjectTree
+from gsseg_core.errors import StateFileError
 from gsseg_core.files.input_files import UnfitError
 from gsseg_core.files.npz_files import NpzArrays, check_shares, class_names_of, open_npz, temperature_of
 from gsseg_core.text import clipped
@@ -25,6 +26,8 @@ def read_segmentation(path: Path, digest: str, num_gaussians: int) -> dict[str, 
     Raises `StateFileError` where it is missing or damaged, or holds what no segmentation holds; `StateMismatchError`
     where it belongs to another scene.
     """
+    if (path / "segmentation.npz").is_file():
+        raise StateFileError(f"{path}: is a folder; expected a segmentation.npz; type {path / 'segmentation.npz'}")
     with open_npz(path, "a segmentation.npz", (FORMAT,), digest) as (file, header):
         names, temperature = class_names_of(header), temperature_of(header)
         if 0 not in names:

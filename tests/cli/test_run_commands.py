@@ -230,6 +230,15 @@ def test_remove_shows_how_many_meshes_are_made_and_quiet_hides_it(
         assert ("mesh: " in capsys.readouterr().err) != quiet
 
 
+def test_remove_without_meshes_leaves_none_of_an_earlier_run_beside_its_file(place: Path) -> None:
+    remove = ["remove", f"{place}/data/scene.ply", "--segmentation", f"{place}/out/segmentation.npz", "--quiet"]
+    (place / "rest_3_box.obj").write_text("# mine\n")
+    assert main([*remove, "--class", "box", "--out", f"{place}/rest.ply", "--collision"]) == 0
+    assert len(list(place.glob("rest_*.obj"))) == 3
+    assert main([*remove, "--class", "cup/mug", "--out", f"{place}/rest.ply"]) == 0
+    assert [path.name for path in place.glob("rest_*.obj")] == ["rest_3_box.obj"]
+
+
 @pytest.mark.parametrize("saved", ["out/report.json", "out/pictures/legend.png", "state.npz"])
 def test_remove_replaces_nothing_but_scenes(place: Path, capsys: pytest.CaptureFixture[str], saved: str) -> None:
     shutil.copy(place / "out/segmentation.npz", place / "state.npz")
@@ -240,6 +249,14 @@ def test_remove_replaces_nothing_but_scenes(place: Path, capsys: pytest.CaptureF
     (place / "empty").touch()
     for name in ("empty", "empty", "rest.spz", "rest.spz"):  # The second time, over what it has written.
         assert main([*remove, "--out", str(place / name)]) == 0
+
+
+def test_the_folder_of_a_run_in_the_place_of_its_segmentation_leads_to_the_file(
+    place: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    given = [f"{place}/data/scene.ply", "--segmentation", f"{place}/out", "--class", "1", "--out", f"{place}/rest.ply"]
+    assert main(["remove", *given]) == 2
+    assert_one_line(capsys.readouterr().err, f"out: is a folder; expected a segmentation.npz; type {place}/out/segm")
 
 
 @pytest.mark.parametrize("read", ["data/scene.ply", "out/segmentation.npz"])
