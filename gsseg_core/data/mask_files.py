@@ -168,6 +168,12 @@ def _read_detections(folder: Path, camera: Camera | None, within: Path | None) -
         if int(path.stem) in detections:
             raise MaskFormatError(f"{folder}: has two images of class {path.stem}; expected one")
         detections[int(path.stem)] = _read_image(path, camera, within)
+    if not detections:
+        there = clipped(", ".join(path.name for path in list_folder(folder, MaskFormatError, within)))
+        raise MaskFormatError(
+            f"{folder}: holds no detections{there and ', but '}{there}; expected an image of each class that was "
+            "looked for, such as '12.png', zeros where it is not seen"
+        )
     return combine_detections(detections, unknown=unknown, source=str(folder))
 
 

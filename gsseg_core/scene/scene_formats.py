@@ -134,9 +134,10 @@ def scene_hint(path: Path) -> str:
     """Hint at where a scene lies, if a folder or nothing was found in its place; "" where one may not look."""
     with suppress(OSError):
         if path.is_dir():
-            # Trainers write point_cloud/iteration_30000/point_cloud.ply; the one of most steps is wanted.
+            # Trainers write point_cloud/iteration_30000/point_cloud.ply; the one of most steps is wanted, and not the
+            # input.ply beside it, which are COLMAP's points.
             trained = sorted(path.glob("point_cloud/iteration_*"), key=lambda folder: (len(folder.name), folder.name))
-            found = [scene for folder in (*trained, path) for scene in _scenes_in(folder)]
+            found = [scene for folder in (path, *trained) for scene in _scenes_in(folder)]
             return f"; type {shlex.quote(str(found[-1]))}" if found else "; no scene lies in it"
         if not path.exists():
             near = _scenes_in(path.parent)

@@ -48,7 +48,9 @@ def check_properties(vertices: npt.NDArray[np.void], needed: Iterable[str], sour
     """Raise `ScenePropertyError` if vertices (N,) lack a property."""
     missing = [name for name in needed if name not in (vertices.dtype.names or ())]
     if missing:
-        raise ScenePropertyError(f"{source}: not a 3DGS scene, lacks the vertex properties {', '.join(missing)}")
+        are_points = {"opacity", "scale_0"} <= set(missing)
+        hint = "; points of COLMAP or a scanner are what a scene is trained from" if are_points else ""
+        raise ScenePropertyError(f"{source}: not a 3DGS scene, lacks the vertex properties {', '.join(missing)}{hint}")
 
 
 def pack_vertices(

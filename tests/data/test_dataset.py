@@ -190,6 +190,13 @@ def test_a_mask_of_another_shape_is_refused(tmp_path: Path) -> None:
     )
 
 
+def test_a_mask_that_was_turned_by_exif_is_told_from_one_of_another_shape(tmp_path: Path) -> None:
+    view = Dataset(make_dataset(tmp_path)).views()[0]
+    write_mask(tmp_path / "labels" / "a.png", np.zeros((WIDTH * 2, HEIGHT * 2), np.int32), 8)
+    with pytest.raises(MaskSizeError, match=r"is for an image of 8 x 12 pixels; .* or smaller; it lies on its side"):
+        view.read_labels()
+
+
 def test_an_rgb_mask_is_refused(tmp_path: Path) -> None:
     view = Dataset(make_dataset(tmp_path)).views()[0]
     Image.new("RGB", (WIDTH, HEIGHT)).save(tmp_path / "labels" / "a.png")

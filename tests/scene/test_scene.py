@@ -220,7 +220,9 @@ def test_missing_properties_are_listed(tmp_path: Path) -> None:
 
 def test_a_point_cloud_is_not_a_scene(tmp_path: Path) -> None:
     path = write_ply(tmp_path / "cloud.ply", np.zeros(3, [("x", "f4"), ("y", "f4"), ("z", "f4"), ("red", "u1")]))
-    with pytest.raises(ScenePropertyError, match=r"not a 3DGS scene, lacks the vertex properties f_dc_0, .*, rot_3"):
+    with pytest.raises(
+        ScenePropertyError, match=r"not a 3DGS scene, lacks the vertex properties f_dc_0, .*, rot_3; points"
+    ):
         GaussianScene.load(path)
 
 

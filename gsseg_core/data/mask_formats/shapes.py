@@ -225,9 +225,11 @@ def check_fit(width: int, height: int, camera: Camera, where: str) -> None:
     expected = camera.image_size
     scale = (expected[0] * expected[1] / max(width * height, 1)) ** 0.5
     if max(abs(width * scale - expected[0]), abs(height * scale - expected[1])) > 1:
+        turned = width * expected[0] == height * expected[1]
+        hint = "; it lies on its side: make masks of photos as they are stored, not turned as their EXIF data say"
         raise MaskSizeError(
             f"{where}: is for an image of {width} x {height} pixels; expected {expected[0]} x {expected[1]}, the "
-            f"size of camera '{clipped(camera.name)}', or the same larger or smaller"
+            f"size of camera '{clipped(camera.name)}', or the same larger or smaller{hint if turned else ''}"
         )
 
 
