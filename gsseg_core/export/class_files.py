@@ -120,8 +120,8 @@ def write_selection(
 ) -> None:
     """Write some Gaussians of a scene as one file, in which USD keeps the classes of these labels apart.
 
-    Meshes to collide with go into the USD, or beside another file, as `<its stem>_<id>_<name>.obj`; others that an
-    earlier call wrote there for these classes are removed. If anything cannot be written, all files are as they were.
+    Meshes to collide with go into the USD, or beside another file, as `<its stem>_<id>_<name>.obj`; those that an
+    earlier call wrote there for other classes are removed. If anything cannot be written, all files are as they were.
     Raises what `gsseg_core.scene.scene_writers.write_scene` does, and `EmptySceneError` where none is chosen.
     """
     part = scene.subset(chosen)
@@ -132,7 +132,7 @@ def write_selection(
             for k, mesh in meshes.items():
                 mesh.write(written.enter_context(write_atomically(places[k])))
             write_scene(part, path, scene_format)
-        for k in places.keys() - meshes.keys():
+        for k in places.keys() - meshes.keys() if meshes else ():
             _remove_mesh(places[k])
         return
     labels = labels[chosen]

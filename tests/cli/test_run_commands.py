@@ -230,15 +230,6 @@ def test_remove_shows_how_many_meshes_are_made_and_quiet_hides_it(
         assert ("mesh: " in capsys.readouterr().err) != quiet
 
 
-def test_remove_without_meshes_leaves_none_of_an_earlier_run_beside_its_file(place: Path) -> None:
-    remove = ["remove", f"{place}/data/scene.ply", "--segmentation", f"{place}/out/segmentation.npz", "--quiet"]
-    (place / "rest_3_box.obj").write_text("# mine\n")
-    assert main([*remove, "--class", "box", "--out", f"{place}/rest.ply", "--collision"]) == 0
-    assert len(list(place.glob("rest_*.obj"))) == 3
-    assert main([*remove, "--class", "cup/mug", "--out", f"{place}/rest.ply"]) == 0
-    assert [path.name for path in place.glob("rest_*.obj")] == ["rest_3_box.obj"]
-
-
 @pytest.mark.parametrize("saved", ["out/report.json", "out/pictures/legend.png", "state.npz"])
 def test_remove_replaces_nothing_but_scenes(place: Path, capsys: pytest.CaptureFixture[str], saved: str) -> None:
     shutil.copy(place / "out/segmentation.npz", place / "state.npz")

@@ -240,7 +240,13 @@ def test_a_shift_drag_corrects_what_is_in_the_box(shown: Shown) -> None:
     shown.page.mouse.move(x + 15, y + 15, steps=3)
     shown.page.mouse.up()
     shown.page.keyboard.up("Shift")
-    shown.wait(lambda: len(shown.viewer.state.corrections) == 1, "the correction")
+    state = shown.viewer.state
+
+    def is_corrected() -> bool:
+        with state.lock:  # What follows from a correction is there when the lock is free again.
+            return len(state.corrections) == 1
+
+    shown.wait(is_corrected, "the correction")
     assert (probabilities_of(shown.viewer.state.objects) != probabilities_of(LEARNT))[TRUTH == 1].any()
     (drawn,) = shown.viewer.state.corrections.drawn
     assert drawn.votes.sum() > 100  # px
