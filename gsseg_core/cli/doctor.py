@@ -20,7 +20,16 @@ from importlib import metadata
 from itertools import groupby
 from pathlib import Path
 
-from gsseg_core.cli.shared import LABELS, add_dataparser, add_device, add_quiet, labels_path, load_kernels, placed
+from gsseg_core.cli.shared import (
+    LABELS,
+    add_dataparser,
+    add_device,
+    add_quiet,
+    hint_at_own_ids,
+    labels_path,
+    load_kernels,
+    placed,
+)
 from gsseg_core.cli.terminal import note, tell
 from gsseg_core.errors import GssegError, SettingsError
 from gsseg_core.kernels import kernel_cache
@@ -96,7 +105,8 @@ def run(options: argparse.Namespace) -> int:
     if options.scene:
         return _examine_frame(options)
     if options.path:
-        dataset = examine_dataset(options.path, options.labels)
+        with hint_at_own_ids():
+            dataset = examine_dataset(options.path, options.labels)
         tell(_listed(dataset or examine_scene(options.path)))
         return 0
     findings = examine(note)

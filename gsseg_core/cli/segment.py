@@ -3,10 +3,20 @@
 from __future__ import annotations
 
 import argparse
+from contextlib import nullcontext
 from statistics import median
 from typing import Any
 
-from gsseg_core.cli.shared import LABELS, add_collision, add_format, add_scene, labels_path, load_kernels
+from gsseg_core.cli.shared import (
+    LABELS,
+    OWN_IDS,
+    add_collision,
+    add_format,
+    add_scene,
+    hint_at_own_ids,
+    labels_path,
+    load_kernels,
+)
 from gsseg_core.cli.terminal import note, tell
 from gsseg_core.learn.registry import DEFAULT, LEARNERS, distributed_learners
 from gsseg_core.progress import progress_bars
@@ -79,7 +89,8 @@ def run(options: argparse.Namespace) -> int:
         filter=outer == "paper", carve=outer == "carve",
     )  # fmt: skip
     load_kernels(options.quiet, options.device)
-    with progress_bars(options.quiet) as progress:
+    hint = nullcontext() if options.ids else hint_at_own_ids()
+    with hint, progress_bars(options.quiet) as progress:
         report = pipeline.segment(
             options.scene, options.data, options.out, labels=labels_path(options.data, options.labels),
             learner=options.learner, views=options.views, refine=refine, graph=not options.no_graph,
@@ -98,7 +109,6 @@ def run(options: argparse.Namespace) -> int:
 
 def _note_doubts(options: argparse.Namespace, report: dict[str, Any]) -> None:
     """Warn of what makes a whole run worthless."""
-    from gsseg_core.data.label_images import OWN_IDS
     from gsseg_core.report.findings import NO_OBJECTS, has_objects, renamed_ids_of
 
     known = [view["reliability"] for view in report["views"].get("reliability", ()) if view["reliability"] is not None]

@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import argparse
 import os
-from collections.abc import Callable
-from contextlib import suppress
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from gsseg_core.cli.terminal import note
-from gsseg_core.errors import GssegError, PathTakenError, SettingsError
+from gsseg_core.errors import GssegError, PathTakenError, SettingsError, UnknownLabelError
 from gsseg_core.progress import progress_bars
 from gsseg_core.raster.backends import devices, rasteriser_of
 from gsseg_core.scene.scene_writers import SCENE_WRITERS
@@ -21,6 +21,7 @@ if TYPE_CHECKING:
     from gsseg_core.scene.gaussian_scene import GaussianScene
 
 LABELS = "labels"  # folder of the masks in a dataset, unless `--labels` names another
+OWN_IDS = "where an id holds in its own view only, as SAM's do, it takes --ids per-view"
 
 
 def add_scene(parser: argparse.ArgumentParser) -> None:
@@ -72,6 +73,15 @@ def labels_path(data: str, labels: str) -> str:
     is_elsewhere = not os.path.exists(os.path.join(data, labels)) and os.path.exists(labels)
     # The default is a folder of the dataset only: masks that lie here by chance were not asked for.
     return os.path.abspath(labels) if is_elsewhere and labels != LABELS else labels
+
+
+@contextmanager
+def hint_at_own_ids() -> Iterator[None]:
+    """Add to the error of an id that is no class how ids of a view's own are learnt: by `gsseg segment` alone."""
+    try:
+        yield
+    except UnknownLabelError as error:
+        raise UnknownLabelError(f"{error}; {OWN_IDS}") from error
 
 
 def placed(options: argparse.Namespace, scene: GaussianScene, dataset: Dataset, *, align: bool) -> Placed:

@@ -34,7 +34,6 @@ GLOBAL = "global"
 PER_VIEW = "per-view"
 IDS = (GLOBAL, PER_VIEW)
 """Whether an id means the same in every view, or the objects are to be found."""
-OWN_IDS = f"where an id holds in its own view only, as SAM's do, it takes --ids {PER_VIEW}"
 
 _PNG_KINDS = {0: "gray", 2: "RGB", 3: "palette", 4: "gray + alpha", 6: "RGBA"}
 

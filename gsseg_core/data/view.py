@@ -12,7 +12,7 @@ import numpy as np
 import numpy.typing as npt
 
 from gsseg_core.data.class_names import listed
-from gsseg_core.data.label_images import OWN_IDS, UNKNOWN, digest_of, mask_header
+from gsseg_core.data.label_images import UNKNOWN, digest_of, mask_header
 from gsseg_core.data.label_map import LabelMap
 from gsseg_core.data.mask_files import read_soft_mask
 from gsseg_core.data.mask_formats.images import read_label_image
@@ -328,8 +328,7 @@ class View:
         if unknown:
             expected = f"0 to {MAX_LABEL}, or {UNKNOWN} for unknown"
             if self.class_names is not None:
-                hint = f"; {OWN_IDS}" if self.mask_path else ""
-                expected = f"ids from {min(self.class_names)} to {max(self.class_names)} that classes.json names{hint}"
+                expected = f"ids from {min(self.class_names)} to {max(self.class_names)} that classes.json names"
             raise UnknownLabelError(f"{source}: mask holds the labels {listed(map(str, unknown))}; expected {expected}")
 
 

@@ -190,6 +190,14 @@ def test_a_mask_of_another_shape_is_refused(tmp_path: Path) -> None:
     )
 
 
+def test_the_error_of_an_id_without_a_name_proposes_no_option_of_one_command(tmp_path: Path) -> None:
+    (make_dataset(tmp_path) / "classes.json").write_text('{"0": "background", "3": "table"}')
+    view = Dataset(tmp_path).views()[0]
+    write_mask(tmp_path / "labels" / "a.png", np.full((HEIGHT, WIDTH), 9, np.int32), 8)
+    with pytest.raises(UnknownLabelError, match=r"labels 9; expected ids from 0 to 3 that classes\.json names$"):
+        view.read_labels()
+
+
 def test_a_mask_that_was_turned_by_exif_is_told_from_one_of_another_shape(tmp_path: Path) -> None:
     view = Dataset(make_dataset(tmp_path)).views()[0]
     write_mask(tmp_path / "labels" / "a.png", np.zeros((WIDTH * 2, HEIGHT * 2), np.int32), 8)
