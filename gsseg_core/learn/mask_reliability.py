@@ -9,7 +9,7 @@ is predicted that was not looked for.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from contextlib import closing
 from dataclasses import dataclass, field, replace
 from typing import Any
@@ -32,6 +32,9 @@ from gsseg_core.several_at_once import each_with_made, several_at_once
 WORST = 4  # views that are trusted least, as pictures show them
 _LARGE = 1 << 17  # px: of a larger view, every third tile is compared
 _TILE = 16  # px a side
+
+Cells = tuple[np.ndarray, np.ndarray, np.ndarray]
+"""Counts that are not 0: class predicted, label, and pixels, (Z,) int64 each."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -84,8 +87,8 @@ class ViewCheck:
             predicted = np.where(unknown & ((predicted == UNKNOWN) | (beside == mask)), beside, predicted)
         return predicted
 
-    def cells(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """List the counts that are not 0: class predicted, label, which is a class, and pixels, (C,) int64 each."""
+    def cells(self) -> Cells:
+        """List the counts that are not 0, of labels that are classes."""
         predicted, place = np.nonzero(self.counts)
         labels = self.classes[place].astype(np.int64)
         named = labels >= 0
@@ -101,6 +104,13 @@ class ViewCheck:
     def _right(self) -> tuple[np.ndarray, np.ndarray]:
         """Where in the counts class and label agree."""
         return (self.evidence or LabelEvidence(self.classes)).correct_words(len(self.counts))
+
+
+def sum_cells(cells: Sequence[Cells]) -> Cells:
+    """Add up the cells of some views; in the order of the classes predicted, and of the labels for each."""
+    predicted, labels, pixels = map(np.concatenate, zip(*cells, strict=True))
+    pairs, place = np.unique(predicted << 32 | labels, return_inverse=True)
+    return pairs >> 32, pairs & 0xFFFFFFFF, np.bincount(place, pixels).astype(np.int64)
 
 
 def largest_cells(counts: np.ndarray, count: int) -> list[tuple[int, int, int]]:

@@ -7,7 +7,7 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 
 from gsseg_core.data.class_names import class_name
-from gsseg_core.learn.mask_reliability import ViewCheck
+from gsseg_core.learn.mask_reliability import ViewCheck, sum_cells
 
 RENAMED = 0.25  # share of an id's pixels from which on it is one of several; where ids hold, next to none are
 
@@ -21,10 +21,8 @@ def renamed_ids(checks: Sequence[ViewCheck]) -> dict[int, int]:
     Returns, by each such id, ascending, the one of these that most pixels are given to.
     """
     cells = [check.cells() for check in checks]
-    given, label, counts = (np.concatenate(each) for each in zip(*cells, strict=True))
+    given, label, counts = sum_cells(cells)
     width = int(max(given.max(initial=0), label.max(initial=0))) + 1
-    pairs, place = np.unique(label * width + given, return_inverse=True)
-    (label, given), counts = np.divmod(pairs, width), np.bincount(place, counts)
     together, views = (label == 0) | (given == 0), np.zeros(width, np.int64)
     for _, labels, _ in cells:
         shown = np.zeros(width, bool)

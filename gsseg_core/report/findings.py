@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from gsseg_core.data.view import View
-from gsseg_core.learn.mask_reliability import ViewCheck
+from gsseg_core.learn.mask_reliability import ViewCheck, sum_cells
 from gsseg_core.metrics import iou
 from gsseg_core.text import counted
 
@@ -72,9 +72,7 @@ class MaskChecks:
 
     def confusion(self) -> Confusion:
         """Count pixels over all views. "None of these" of a partial mask is no class, and is not counted."""
-        rows, columns, counts = map(np.concatenate, zip(*(check.cells() for check in self.checks), strict=True))
-        pairs, place = np.unique(rows << 32 | columns, return_inverse=True)
-        return Confusion(pairs >> 32, pairs & 0xFFFFFFFF, np.bincount(place, counts).astype(np.int64))
+        return Confusion(*sum_cells([check.cells() for check in self.checks]))
 
     def views_showing(self, num_classes: int) -> np.ndarray:
         """Count the views that show each class, by what is predicted: (K,) int64."""
