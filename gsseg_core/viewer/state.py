@@ -207,14 +207,14 @@ class ViewerState:
     @contextmanager
     def _relabelling(self) -> Iterator[None]:
         """Change the corrections or what was learnt, and show what follows; where that fails, nothing has changed."""
-        model, drawn = self.model, self.corrections
+        model, corrections = self.model, self.corrections
         with self.lock:
-            before = drawn.drawn, self._learnt, self.added_names, model.hidden, model.removed
+            before = corrections.drawn, self._learnt, self.added_names, model.hidden, model.removed
             try:
                 yield
                 self._relabel(self.granularity)
             except BaseException:
-                drawn.drawn, self._learnt, self.added_names, model.hidden, model.removed = before
+                corrections.drawn, self._learnt, self.added_names, model.hidden, model.removed = before
                 raise
 
     def _relabel(self, granularity: float) -> None:

@@ -1,0 +1,123 @@
+"""What the viewer answers to a click, and how long the answer, or an error in its place, is true."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import closing
+from pathlib import Path
+from unittest.mock import MagicMock
+
+import numpy as np
+import pytest
+from labellings import labelled
+from parts_of_balls import tree_of_balls
+from patience import wait_until
+from small_scenes import NAMES, balls_on_a_table, clean_views, ring, write_dataset
+
+pytest.importorskip("viser")
+
+from gsseg_core.data.dataset import Dataset
+from gsseg_core.errors import MaskFormatError
+from gsseg_core.scene.camera import Camera
+from gsseg_core.viewer.access import listen
+from gsseg_core.viewer.clients import SERVER
+from gsseg_core.viewer.corrections import disc
+from gsseg_core.viewer.model import ViewModel
+from gsseg_core.viewer.picking import Picked
+from gsseg_core.viewer.viewer import Viewer
+
+SCENE, TRUTH = balls_on_a_table()
+LEARNT = labelled(TRUTH.astype(np.int32), np.eye(len(NAMES), dtype=np.float32)[TRUTH] * np.float32(0.9), dict(NAMES))
+CAMERA = ring(1)[0]
+((COLUMN, ROW),), _ = CAMERA.project(SCENE.means[TRUTH == 1].mean(axis=0, keepdims=True))
+IN_BALL = int(np.flatnonzero(TRUTH == 1)[-1])
+PORT = 18340
+
+
+@pytest.fixture
+def viewer() -> Iterator[Viewer]:
+    model = ViewModel(SCENE, LEARNT, class_ids=tuple(NAMES), tree=tree_of_balls())
+    with closing(Viewer(model, listener=listen(port=PORT), draw=SERVER)) as opened:
+        yield opened
+
+
+def viewed_from(camera: Camera) -> MagicMock:
+    """A browser that looks from there, wherever it looks to."""
+    seen = MagicMock(fov=1.0, aspect=1.0, image_height=480, position=camera.center, wxyz=np.eye(4)[0])
+    return MagicMock(camera=seen)
+
+
+def click_at(client: MagicMock, gaussian: int) -> MagicMock:
+    """A click of a browser on a Gaussian."""
+    eye = client.camera.position
+    return MagicMock(client=client, ray_origin=eye, ray_direction=SCENE.means[gaussian] - eye)
+
+
+def test_the_answer_to_a_click_follows_corrections_and_what_takes_them_back(viewer: Viewer) -> None:
+    answer, state = viewer.panel.answer, viewer.state
+
+    def tells(name: str) -> None:
+        wait_until(lambda: f"<strong>{name}</strong>" in answer._answer.content, f"the answer {name}")
+
+    state.correct(disc(CAMERA, COLUMN, ROW, 3, 2))
+    changed = int(np.flatnonzero(state.objects.labels != TRUTH)[0])
+    answer.show_picked(answer.ask(), Picked(changed, 0.5))
+    tells(NAMES[2])
+    assert not answer._parts.visible and answer._whole.visible
+    state.undo()
+    tells(NAMES[1])
+    assert answer._parts.visible and not answer._whole.visible
+
+
+def test_an_earlier_click_says_nothing_any_more_once_a_later_one_is_answered(viewer: Viewer) -> None:
+    answer = viewer.panel.answer
+    first, second = answer.ask(), answer.ask()
+    answer.show_picked(second, Picked(IN_BALL, 0.5))
+    answer.show_picked(first, Picked(0, 0.5), [])
+    assert f"Gaussian {IN_BALL}, " in answer._answer.content
+    with answer.telling(None):
+        viewer.state.selection("no such format")
+    answer.refresh()
+    assert "That did not work" in answer._answer.content and not answer._parts.visible
+
+
+def test_a_click_is_answered_without_the_views_once_a_mask_cannot_be_read(tmp_path: Path) -> None:
+    data = write_dataset(tmp_path / "data")
+    views = Dataset(data).views("train")
+    (data / "labels" / f"{views[1].name}.png").write_bytes(b"no picture")
+    client = viewed_from(CAMERA)
+    with closing(Viewer(ViewModel(SCENE, LEARNT), views, listener=listen(port=PORT), draw=SERVER)) as viewer:
+        for _ in range(2):
+            viewer._on_click(click_at(client, IN_BALL))
+            assert f"<strong>{NAMES[1]}</strong>, class 1" in viewer.panel.answer._answer.content
+            assert f"{views[1].name}.png" in client.add_notification.call_args.args[1]
+            assert "voted for it" not in viewer.panel.answer._answer.content
+
+
+def test_a_mask_that_cannot_be_read_leaves_the_answer_to_a_later_click(
+    viewer: Viewer, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    answer, client = viewer.panel.answer, viewed_from(CAMERA)
+
+    def view_votes(progress: object) -> None:
+        answer.show_picked(answer.ask(), Picked(0, 0.5))
+        raise MaskFormatError("view1.png: no picture")
+
+    viewer.state.views = tuple(clean_views(1))
+    monkeypatch.setattr(viewer.state, "view_votes", view_votes)
+    viewer._on_click(click_at(client, IN_BALL))
+    assert "Gaussian 0, " in answer._answer.content and "no picture" in client.add_notification.call_args.args[1]
+
+
+def test_an_error_is_told_until_somebody_does_what_works(viewer: Viewer) -> None:
+    answer, client = viewer.panel.answer, viewed_from(CAMERA)
+    with answer.telling(client):
+        viewer.state.selection("no such format")
+    with answer.telling(None):  # What the viewer sets itself is nobody's act.
+        pass
+    assert "That did not work" in answer._answer.content
+    with answer.telling(client):
+        viewer.state.undo()
+    assert "Click on something" in answer._answer.content
+    viewer._on_click(click_at(client, IN_BALL))
+    assert f"<strong>{NAMES[1]}</strong>" in answer._answer.content
