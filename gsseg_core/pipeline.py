@@ -124,7 +124,8 @@ def segment(
     )  # fmt: skip
     watch = Stopwatch()
     settings.check()
-    with staged_run(out, "segment", places=settings.places({}, [])) as run:
+    folders = data, Path(data, labels), Path(data, "images")
+    with staged_run(out, "segment", places=settings.places({}, []), inputs=folders) as run:
         with ExitStack() as workers:
             with watch.stage("load"):
                 client = _connect(scheduler, workers)
@@ -306,7 +307,9 @@ def render(
     names, overlays = [view_file_name(view.name) for view in views], []
     overview = ("contact_sheet.png", "legend.png")
     pictures = {name: f"overlays/{'overlay_' * (name in overview)}{name}" for name in names}
-    with staged_run(out, "render", places=[*names, *pictures.values(), *(f"overlays/{k}" for k in overview)]) as run:
+    places = [*names, *pictures.values(), *(f"overlays/{k}" for k in overview)]
+    folders = data, Path(data, "labels"), Path(data, "images")
+    with staged_run(out, "render", places=places, inputs=folders) as run:
         drawn, save = draw_views(scene, numbered, views, device=device), partial(save_png, run=run.id)
         for name, (_, labels, image, _) in zip(with_progress(progress, "render", names), drawn, strict=True):
             write_mask(run.folder / name, ids[labels], bits, run.id)

@@ -70,7 +70,9 @@ def run(options: argparse.Namespace) -> int:
     load_kernels(options.quiet, options.device)
     posed = placed(options, scene, dataset, align=options.align).dataset
     cameras = {camera.name: camera for camera in posed.cameras}
-    with staged_run(out, "pick", places=(file, "object.obj", "pick.npz", "pick.png", "next.png")) as run:
+    places = file, "object.obj", "pick.npz", "pick.png", "next.png"
+    inputs = dataset.root, dataset.root / "labels", dataset.root / "images"
+    with staged_run(out, "pick", places=places, inputs=inputs) as run:
         picked = _picked(options, scene, cameras, dataset)
         _write(options, scene, picked, cameras[options.views[0]], run.folder / file, run.id)
         unseen = spread([camera for name, camera in cameras.items() if name not in options.views], CANDIDATES)

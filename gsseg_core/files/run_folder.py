@@ -46,11 +46,13 @@ _PROBE = 1 << 16  # bytes that must fit on the disk before work begins
 
 
 @contextlib.contextmanager
-def staged_run(out: str | os.PathLike[str], kind: str, *, places: Iterable[str] = ()) -> Iterator[StagedRun]:
+def staged_run(
+    out: str | os.PathLike[str], kind: str, *, places: Iterable[str] = (), inputs: Iterable[str | os.PathLike[str]] = ()
+) -> Iterator[StagedRun]:  # fmt: skip
     """Yield a run whose files, at the end of the body, become the result of their kind in `out`: all or none.
 
     The folder is made if it is not there; results of other kinds in it stay. `places`, the files that the run will
-    write, as far as they are known, are checked by `StagedRun.claim` at once.
+    write, as far as they are known, are checked by `StagedRun.claim` at once, and that no folder of `inputs` is `out`.
 
     Raises `PathTakenError` where `out`, or a place in it, is taken by what is not gsseg's, and `WriteError` where
     something cannot be written; what was there before is then unchanged, unless the message says otherwise.
@@ -59,6 +61,7 @@ def staged_run(out: str | os.PathLike[str], kind: str, *, places: Iterable[str] 
     try:
         run.begin()
         run.claim(places)
+        run.keep_apart(inputs)
         try:
             yield run
         except GssegError as error:  # Nobody knows the folder in which it was staged.
@@ -116,6 +119,13 @@ class StagedRun:
         manifest = Manifest.read(self.out / RUN_FILE)
         for place in places:
             _check_free(self.out, place, manifest, self._kind)
+
+    def keep_apart(self, inputs: Iterable[str | os.PathLike[str]]) -> None:
+        """Raise `PathTakenError` if a folder that the run reads from is the one that it writes to."""
+        if any(os.path.exists(folder) and os.path.samefile(self.out, folder) for folder in inputs):
+            raise PathTakenError(
+                f"{self.out}: gsseg {self._kind} reads from this folder; expected one for results alone"
+            )
 
     def commit(self) -> None:
         """Make what was written the result."""

@@ -207,6 +207,20 @@ def test_render_never_writes_over_the_masks(place: Path, capsys: pytest.CaptureF
     assert contents(place / "data") == before
 
 
+@pytest.mark.parametrize(("kind", "folder"), [("segment", "data"), ("segment", "data/labels"), ("render", "data")])
+def test_no_run_is_written_between_what_it_reads(
+    place: Path, capsys: pytest.CaptureFixture[str], kind: str, folder: str
+) -> None:
+    before = contents(place)
+    (place / "link").symlink_to(place / folder)
+    for out in (place / folder, place / "link", place / folder / "." / "new" / ".."):
+        assert main([*command(place, kind), "--out", str(out)]) == 2
+        assert_one_line(capsys.readouterr().err, f"gsseg {kind} reads from this folder; expected one for results alone")
+    (place / "link").unlink()
+    assert contents(place) == before
+    assert main([*command(place, kind), "--out", f"{place}/data/out"]) == 0
+
+
 def test_single_files_replace_no_device_and_keep_links(place: Path, capsys: pytest.CaptureFixture[str]) -> None:
     remove = ["remove", f"{place}/data/scene.ply", "--segmentation", f"{place}/out/segmentation.npz", "--class", "box"]
     os.mkfifo(place / "fifo")
