@@ -11,6 +11,7 @@ from gsseg_core.live.results import SCENE_CHANGED
 from gsseg_core.text import counted
 from gsseg_ros.node.complaints import CLOCK, MISSING, NAMESAKES, PERIOD, TIME_JUMP, Complaints
 from gsseg_ros.node.inputs import Inputs
+from gsseg_ros.node.matched_subscription import LATCHED
 from gsseg_ros.node.workspace import Workspace
 
 WINDOW_SECONDS = 10.0
@@ -44,13 +45,12 @@ def missing_inputs(inputs: Inputs) -> dict[str, str]:
     complaints: dict[str, str] = {}
     for topic, role in sorted(inputs.roles.items(), key=lambda item: item[1] != "mask"):  # The mask first.
         count, last = inputs.arrivals[topic]
-        silence = now - last
-        if silence < PERIOD:
+        silence, this_side = now - last, inputs.policies.get(topic, "not subscribed")
+        if silence < PERIOD or (count and this_side.endswith(LATCHED)):
             continue
         publishers = inputs.publishers_of(topic)
         found = counted(publishers, "publisher")
         if publishers and not count:
-            this_side = inputs.policies.get(topic, "not subscribed")
             hint = (
                 f"it has {found}: do their QoS and type match (this side is {this_side}; ros2 topic info -v {topic}), "
                 "and do they publish?"

@@ -2,12 +2,17 @@
 
 from __future__ import annotations
 
-from bisect import insort
-from collections.abc import Callable
+from bisect import bisect_left, insort
+from collections.abc import Callable, Collection
 from typing import Generic, TypeVar
 
 K = TypeVar("K", int, tuple[int, str])
 T = TypeVar("T")
+
+
+def too_many(sizes: Collection[int], capacity: int, most_bytes: int) -> bool:
+    """Whether the oldest of what waits, of these sizes (bytes), has to go; the only one need not, whatever its size."""
+    return len(sizes) > capacity or (len(sizes) > 1 and sum(sizes) > most_bytes)
 
 
 class History(Generic[K, T]):
@@ -32,8 +37,9 @@ class History(Generic[K, T]):
         while self._total > self._capacity and len(self.stamps) > 1:
             self._total -= self._size(self.values.pop(self.stamps.pop(0)))
 
-    def clear(self) -> None:
-        """Forget all values."""
-        self.stamps.clear()
-        self.values.clear()
-        self._total = 0
+    def clear(self, since: K | None = None) -> None:
+        """Forget the values, or those from a stamp on."""
+        first = 0 if since is None else bisect_left(self.stamps, since)
+        for stamp in self.stamps[first:]:
+            self._total -= self._size(self.values.pop(stamp))
+        del self.stamps[first:]

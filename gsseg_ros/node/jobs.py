@@ -9,6 +9,7 @@ from contextlib import contextmanager
 from typing import Generic, TypeVar
 
 from gsseg_ros.errors import BusyError, CanceledError
+from gsseg_ros.node.history import too_many
 
 T = TypeVar("T")
 
@@ -141,7 +142,7 @@ class Worker(Generic[T]):
         """Add an item; returns at once."""
         with self._changed:
             self._items.append(item)
-            while len(self._items) > self._capacity or (len(self._items) > 1 and self._too_large()):
+            while too_many(list(map(self._size, self._items)), self._capacity, self._most_bytes):
                 self._items.popleft()
                 self.dropped += 1
             self._changed.notify()
@@ -171,9 +172,6 @@ class Worker(Generic[T]):
             self._items.clear()
             self._changed.notify()
         self._thread.join(END_SECONDS)
-
-    def _too_large(self) -> bool:
-        return sum(map(self._size, self._items)) > self._most_bytes
 
     def _run(self) -> None:
         while True:

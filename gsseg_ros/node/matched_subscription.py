@@ -13,7 +13,7 @@ from rcl_interfaces.msg import SetParametersResult
 from rclpy.callback_groups import CallbackGroup
 from rclpy.event_handler import SubscriptionEventCallbacks, UnsupportedEventTypeError
 from rclpy.node import Node
-from rclpy.qos import QoSProfile, ReliabilityPolicy
+from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from rclpy.qos_overriding_options import QoSOverridingOptions
 from sensor_msgs.msg import CameraInfo
 
@@ -22,6 +22,10 @@ from gsseg_ros.qos import clear_overrides, input_data
 _SMALL, _SMALL_DEPTH, _DEPTH = (CameraInfo, PoseStamped, Odometry), 600, 100
 """Messages that come while the node is busy wait in the middleware: for seconds, of an odometry at 200 Hz too."""
 
+LATCHED = "transient local"
+"""How a durability is called of which one message may be all that ever comes."""
+
+_TRANSIENT_LOCAL = DurabilityPolicy.TRANSIENT_LOCAL
 _INT32, _UINT32 = 2**31 - 1, 2**32 - 1
 
 
@@ -29,9 +33,10 @@ class MatchedSubscription:
     """A subscription that is reliable while every publisher of its topic is, and best effort while one is not.
 
     What a best-effort stream loses is lost for good, and of large images that may be half; but a reliable subscription
-    hears no best-effort publisher. So it is made anew when the publishers have changed. Where the parameter
-    qos_overrides says how reliable it is to be, it stays so. Raises `SettingsError`: its quality of service is
-    overridden by something impossible.
+    hears no best-effort publisher. So it is made anew when the publishers have changed. Likewise, of camera_infos that
+    are all latched it gets those of before, too, and hears others while one is not. Where the parameter qos_overrides
+    says how reliable it is to be, it stays so. Raises `SettingsError`: its quality of service is overridden by
+    something impossible.
     """
 
     def __init__(
@@ -46,13 +51,13 @@ class MatchedSubscription:
 
     @property
     def policies(self) -> str:
-        """What has to match between publisher and subscription."""
+        """What has to match between publisher and subscription; ends in `LATCHED` if one message may be all."""
         return f"{self._quality.reliability.short_key}, {self._quality.durability.short_key}".replace("_", " ")
 
     def look(self) -> None:
         """Subscribe anew if the publishers have changed; call it some ten times a second."""
         with self._lock:
-            if self._closed or not self._matches or self._offered() == self._quality.reliability:
+            if self._closed or self._offered(self._quality) == (self._quality.reliability, self._quality.durability):
                 return
             self._node.destroy_subscription(self._subscription)
             self._quality, self._subscription = self._subscribe()
@@ -88,15 +93,19 @@ class MatchedSubscription:
 
     def _match(self, quality: QoSProfile) -> SetParametersResult:
         self._matches = quality.reliability == ReliabilityPolicy.BEST_AVAILABLE
-        if self._matches:
-            quality.reliability = self._offered()
+        quality.reliability, quality.durability = self._offered(quality)
         return SetParametersResult(successful=True)
 
-    def _offered(self) -> ReliabilityPolicy:
+    def _offered(self, quality: QoSProfile) -> tuple[ReliabilityPolicy, DurabilityPolicy]:
         """Find out what all publishers offer; reliable while there is none, so that of the first nothing is lost."""
-        publishers = self._node.get_publishers_info_by_topic(self.topic_name)
-        reliable = all(info.qos_profile.reliability == ReliabilityPolicy.RELIABLE for info in publishers)
-        return ReliabilityPolicy.RELIABLE if reliable else ReliabilityPolicy.BEST_EFFORT
+        offers = [info.qos_profile for info in self._node.get_publishers_info_by_topic(self.topic_name)]
+        reliability = quality.reliability
+        if self._matches:
+            reliable = all(offer.reliability == ReliabilityPolicy.RELIABLE for offer in offers)
+            reliability = ReliabilityPolicy.RELIABLE if reliable else ReliabilityPolicy.BEST_EFFORT
+        # Not of masks: those of before this node listened have no pose any more.
+        latched = self._kind is CameraInfo and {offer.durability for offer in offers} == {_TRANSIENT_LOCAL}
+        return reliability, _TRANSIENT_LOCAL if latched else DurabilityPolicy.VOLATILE
 
     def _count_lost(self, event: Any) -> None:
         # Of a large message that a later one has overtaken Fast DDS says besides that 2^31 - 1 are lost.

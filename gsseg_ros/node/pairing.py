@@ -12,7 +12,7 @@ from collections import Counter, deque
 from dataclasses import dataclass
 from typing import Any, NamedTuple, TypeAlias
 
-from gsseg_ros.node.history import History
+from gsseg_ros.node.history import History, too_many
 from gsseg_ros.node.pose_sources import GivenPose, MessagePoses, Pose, PoseSource
 from gsseg_ros.node.timeline import BEHIND_NS, MASK, SECOND, Message, Timeline
 
@@ -223,7 +223,10 @@ class Pairing:
             for waiting in sorted(self._waiting):
                 self._pair(waiting, last_chance=True, epoch=epoch)
             self._poses.set_back(*self._timeline.last_jump)
-            for kept in (self._camera_infos, self._seen, self._depths):
+            for infos in self._camera_infos.values():  # One of earlier may be latched, and not come again.
+                infos.clear(self._timeline.last_jump[1])
+            self._camera_infos = {frame: infos for frame, infos in self._camera_infos.items() if infos.stamps}
+            for kept in (self._seen, self._depths):
                 kept.clear()
             self._unclear_until = 0
         if self._timeline.lost_masks:
@@ -245,13 +248,9 @@ class Pairing:
                 # Where TF is missing hundreds wait, and to look up all with each message would take half a core.
                 if key[0] in came or since is None or self._awake_s - since < _LONG_S:
                     self._pair(key)
-            while self._too_many():
+            most = self._settings.max_waiting, self._settings.max_bytes
+            while too_many([waiting.size for waiting in self._waiting.values()], *most):
                 self._pair(min(self._waiting), last_chance=True)
-
-    def _too_many(self) -> bool:
-        """Whether one of those that wait has to go; the only one need not."""
-        count, size = len(self._waiting), sum(waiting.size for waiting in self._waiting.values())
-        return count > self._settings.max_waiting or (size > self._settings.max_bytes and count > 1)
 
     def _await(self, stamp: int, content: tuple[Any, object, int], frame_id: str) -> None:
         frames = self._seen.values.get(stamp, [])

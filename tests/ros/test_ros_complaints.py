@@ -270,6 +270,17 @@ def test_another_node_of_this_name_is_in_the_verdict_and_now_and_then_in_the_log
     assert hears.verdict() == (DiagnosticStatus.OK, "fusing")
 
 
+def test_an_input_of_which_a_latched_message_is_all_is_not_missed_once_it_came(steady: Steady, hears: Hears) -> None:
+    hears.inputs.roles["/info"], hears.inputs.publishers_of = "camera_info", lambda topic: 1
+    hears.inputs.arrivals["/info"] = (1, steady.seconds)
+    steady.seconds += 6
+    assert hears.verdict()[1].startswith("no data on /info for 6 s; 1 came before")
+    hears.inputs.policies["/info"] = "reliable, transient local"
+    assert hears.verdict() == (DiagnosticStatus.OK, "fusing")
+    hears.inputs.arrivals["/info"] = (0, steady.seconds - 6)
+    assert hears.verdict()[1].startswith("no data on /info for 6 s; it has 1 publisher")
+
+
 def test_refused_poses_explain_masks_without_a_pose(steady: Steady, hears: Hears) -> None:
     hears.inputs.last_refusal = (steady.seconds, "/pose: position is (nan, 0, 0)")
     assert hears.verdict() == (DiagnosticStatus.WARN, "/pose: position is (nan, 0, 0)")

@@ -7,6 +7,7 @@ from typing import Any
 
 import pytest
 from ros_helpers import Ros, ros_fixture  # noqa: F401
+from ros_robot import LATCHED
 
 # isort: split
 from rclpy.callback_groups import MutuallyExclusiveCallbackGroup
@@ -51,6 +52,25 @@ def test_a_subscription_is_reliable_while_all_publishers_are_and_hears_each_of_t
     subscription.close()
     subscription.look()
     ros.wait_until(lambda: asked_of(ros) == [], "the end")
+
+
+def test_a_latched_camera_info_of_before_is_heard_and_so_are_others_beside_it(ros: Ros) -> None:
+    latched = ros.node.create_publisher(CameraInfo, "info", LATCHED)
+    latched.publish(CameraInfo(width=1))
+    heard: list[CameraInfo] = []
+    subscription = subscribed(ros.node, heard)
+
+    def hears(width: int) -> bool:
+        subscription.look()
+        return any(message.width == width for message in heard)
+
+    ros.wait_until(lambda: hears(1), "what was published once, before")
+    other = ros.node.create_publisher(CameraInfo, "info", 1)
+    ros.wait_until(lambda: other.publish(CameraInfo(width=2)) or hears(2), "one that is not latched")
+    ros.node.destroy_publisher(other)
+    heard.clear()
+    ros.wait_until(lambda: hears(1) and subscription.policies == "reliable, transient local", "a change back")
+    subscription.close()
 
 
 def test_where_nothing_counts_what_is_lost_it_subscribes_all_the_same(

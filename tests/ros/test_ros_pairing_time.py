@@ -51,6 +51,16 @@ def test_a_pose_from_before_time_was_set_back_is_not_used_after_it() -> None:
     assert pairing.last_jump == (9 * S, 1 * S)
 
 
+def test_a_camera_info_of_before_all_that_comes_again_serves_in_each_round_of_a_bag() -> None:
+    pairing = Pairing(MessagePoses())
+    send(pairing, [("info", 0)])  # Latched: it does not come again.
+    for _ in range(3):
+        send(pairing, [(kind, second * S) for second in (1, 9) for kind in ("pose", "mask")])
+        expire(pairing)
+    assert (pairing.time_jumps, pairing.dropped) == (2, {})
+    assert [p.camera_info for p in pairing.take()] == ["info 0"] * 6
+
+
 def test_masks_that_wait_when_time_is_set_back_are_counted() -> None:
     pairing = Pairing(MessagePoses())
     send(pairing, [("info", 9 * S), ("mask", 9 * S), ("pose", 8 * S)])

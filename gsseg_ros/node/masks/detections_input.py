@@ -9,6 +9,7 @@ from typing import Any, TypeAlias
 from rclpy.node import Node
 
 from gsseg_ros.conversions import stamp_ns
+from gsseg_ros.node.history import too_many
 from gsseg_ros.node.masks.detections import ADAPTERS, Adapter, Detected
 from gsseg_ros.node.pairing import MOST_BYTES
 
@@ -113,12 +114,9 @@ class DetectionsInput:
             message, mask = self._messages.pop(key), self._masks.pop(mask_key)
             self._forward(self._topic, Detected(message.header, self.adapter, message, mask))
         expected = "expected detections and mask to carry the stamp of the same image"
-        while len(self._masks) > _WAITING or (len(self._masks) > 1 and self._mask_bytes() > MOST_BYTES):
+        while too_many([len(mask.data) for _, mask in self._masks.values()], _WAITING, MOST_BYTES):
             topic, _ = self._masks.pop(next(iter(self._masks)))
             self._lost("no_detections", f"{topic}: no detections with its stamp came on {self._topic}; {expected}")
         if len(self._messages) > _WAITING:
             self._messages.pop(next(iter(self._messages)))
             self._lost("no_mask", f"{self._topic}: no mask with their stamp came; {expected}")
-
-    def _mask_bytes(self) -> int:
-        return sum(len(mask.data) for _, mask in self._masks.values())
