@@ -27,7 +27,7 @@ from gsseg_core.learn.learner import Learner
 from gsseg_core.learn.mask_reliability import MaskChecker, reliability_report, shown_views
 from gsseg_core.learn.prepared_views import default_budget
 from gsseg_core.learn.registry import make_learner
-from gsseg_core.learn.renamed_ids import renamed_report
+from gsseg_core.learn.renamed_ids import renamed_ids, renamed_report
 from gsseg_core.learn.usable_views import NO_MASK, SEES_NOTHING
 from gsseg_core.progress import Progress, Stopwatch, silent, with_progress
 from gsseg_core.refine.label_propagation import UNKNOWN_SHARE, GraphSettings, propagate
@@ -264,7 +264,7 @@ def _assess(learner: Learner, inputs: Inputs, watch: Stopwatch, progress: Progre
             checker = MaskChecker(learner)
             checks = checker.check_all(progress)
             reliability["reliability"] = reliability_report(checks, inputs.class_names)
-            if inputs.objects is None and (renamed := renamed_report(checks, inputs.class_names)):
+            if inputs.objects is None and (renamed := renamed_report(renamed_ids(checks), inputs.class_names)):
                 reliability["renamed"] = renamed
     with watch.stage("calibrate"):
         calibration = calibrate(learner, checker, progress)

@@ -22,7 +22,7 @@ BACKGROUND_NAME = "background"
 MAX_CLASS_NAME = 200  # characters
 MAX_VIEW_NAME = 240  # bytes in UTF-8: files are called after views, and a file name has 255 at most
 
-_LISTED = 20
+_LISTED, NOTED = 20, 5
 
 
 def read_classes(path: str | os.PathLike[str], within: Path | None = None) -> dict[int, str]:
@@ -94,11 +94,11 @@ def flaw_of_view_name(name: str) -> str:
     return _flaw(name) or (f"{quoted(name)} of {size:,} bytes; {wanted}" if size > MAX_VIEW_NAME else "")
 
 
-def listed(names: Iterable[str]) -> str:
+def listed(names: Iterable[str], most: int = _LISTED) -> str:
     """List names for a message: the first ones, and how many more there are."""
     every = [clipped(name) for name in names]
-    more = len(every) - _LISTED
-    return ", ".join(every[:_LISTED]) + (f" and {more:,} more" if more > 0 else "")
+    more = len(every) - most
+    return ", ".join(every[:most]) + (f" and {more:,} more" if more > 0 else "")
 
 
 def id_of(text: str, class_names: Mapping[int, str]) -> int | None:

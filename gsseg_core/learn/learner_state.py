@@ -69,6 +69,8 @@ class Learnt:
     num_views: int  # that it learnt from
     temperature: float = 1.0  # at which the codes are probabilities, see `gsseg_core.learn.calibrate`
     evidence: np.ndarray | None = None  # (N,) float32: px that the codes stand on; an older state does not say
+    # Ids in the masks that name one object, see `gsseg_core.learn.renamed_ids`; a state on disk does not say.
+    renamed: Mapping[int, int] = field(default_factory=dict)
 
     def carried(self, carry: Callable[[Any], Any]) -> Learnt:
         """Return it for a scene that has changed; `carry` makes rows of Gaussians, dense or sparse, those of now."""

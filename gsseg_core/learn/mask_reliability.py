@@ -133,12 +133,13 @@ class MaskChecker:
         self.learner = learner
         self._sampled = {view.name for view in spread(list(learner.views.values()), VIEWS)}
         self._samples: dict[str, Sample] = {}
+        self.sampled_checks: dict[str, ViewCheck] = {}  # by name of the view, of those that `sample` was asked for
 
     def sample(self, view: View) -> Sample:
         """Take pixels of a view's mask with their predicted probabilities, to fit the temperature to."""
         if view.name not in self._samples:
-            seen = view.read_seen()
-            self._predict(view, seen, _compared(seen.labels))
+            self._sampled.add(view.name)
+            self.sampled_checks[view.name] = self._check(view)
         return self._samples[view.name]
 
     def check_all(self, progress: Progress = silent) -> list[ViewCheck]:

@@ -18,6 +18,8 @@ from gsseg_core.errors import (
 from gsseg_core.learn.calibrate import calibrate
 from gsseg_core.learn.learner import Learner
 from gsseg_core.learn.learner_state import Learnt
+from gsseg_core.learn.mask_reliability import MaskChecker
+from gsseg_core.learn.renamed_ids import renamed_among_samples
 from gsseg_core.progress import Stopwatch
 
 Report = Callable[[str, int, int, float], None]
@@ -85,6 +87,8 @@ def observe_and_fit(name: str, learner: Learner, views: Sequence[View], report: 
     with watch.stage("learn"):
         learner.fit(progress)
     with watch.stage("calibrate"):
-        temperature = calibrate(learner, progress=progress).temperature
-    learnt = Learnt(name, learner.code_rows_, len(learner.views), temperature, learner.evidence())
+        checker = MaskChecker(learner)
+        temperature = calibrate(learner, checker, progress).temperature
+        renamed = renamed_among_samples(checker) if learner.checks_masks else {}
+    learnt = Learnt(name, learner.code_rows_, len(learner.views), temperature, learner.evidence(), renamed)
     return Outcome(learnt, len(learner.history_), learner.converged_, learner.loss, dict(learner.rejected))

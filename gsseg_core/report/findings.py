@@ -8,8 +8,10 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from gsseg_core.data.class_names import NOTED, listed
 from gsseg_core.data.view import View
 from gsseg_core.learn.mask_reliability import ViewCheck, sum_cells
+from gsseg_core.learn.renamed_ids import renamed_note
 from gsseg_core.metrics import iou
 from gsseg_core.text import counted
 
@@ -21,7 +23,6 @@ NO_OBJECTS = (
     "the masks name none, or contradict each other; expected ids from 1, as 0 is the background and 255 (in masks of "
     "16 bits 65535) unknown; detections of 8 bits are 0 to 255, not 0 and 1"
 )
-NOTED = 5  # names in a warning, at most
 
 
 class Confusion(NamedTuple):
@@ -90,15 +91,7 @@ def has_objects(report: Mapping[str, Any]) -> bool:
 
 def renamed_ids_of(report: Mapping[str, Any]) -> str:
     """Say in a sentence without its stop which ids name objects that have another, and what to do; "" if none does."""
-    renamed = report["views"].get("renamed")
-    if not renamed:
-        return ""
-    pairs = _some([f"{entry['name']} ({entry['others_say']})" for entry in renamed])
-    return (
-        f"other views call {counted(len(renamed), 'id')} by another that no mask shows beside it: {pairs}. Did a "
-        "tracker lose objects and name them anew, or are there two names for one thing? --ids per-view finds objects "
-        "whatever their ids are, and --label-map puts names together"
-    )
+    return renamed_note(report["views"].get("renamed", ()), "--ids per-view", "--label-map")
 
 
 def warnings_of(report: Mapping[str, Any], ious: np.ndarray | None) -> list[str]:
@@ -122,7 +115,8 @@ def warnings_of(report: Mapping[str, Any], ious: np.ndarray | None) -> list[str]
         warnings.append(
             f"{len(doubtful)} of {len(views['reliability'])} {whose} with the other views in more than "
             f"{100 - round(100 * TRUSTED)} % of {'their' if len(doubtful) > 1 else 'its'} pixels: "
-            f"{_some([view['name'] for view in doubtful])}. Wrong ids, a wrong pose, or a mask of another image?"
+            f"{listed((view['name'] for view in doubtful), NOTED)}. Wrong ids, a wrong pose, or a mask of another "
+            "image?"
         )
     if renamed := renamed_ids_of(report):
         warnings.append(f"{renamed[:1].upper()}{renamed[1:]}.")
@@ -131,16 +125,16 @@ def warnings_of(report: Mapping[str, Any], ious: np.ndarray | None) -> list[str]
     if empty and report.get("ids"):
         warnings.append(
             f"{len(empty):,} of {counted(report['ids']['objects'], 'object')} that were found got no Gaussian, as "
-            f"other views give what their masks show to others: {_some(empty)}."
+            f"other views give what their masks show to others: {listed(empty, NOTED)}."
         )
     elif empty:
-        warnings.append(f"{counted(len(empty), 'class', 'classes')} got no Gaussian: {_some(empty)}.")
+        warnings.append(f"{counted(len(empty), 'class', 'classes')} got no Gaussian: {listed(empty, NOTED)}.")
     if ious is not None:
         weak = [names[k] for k in np.argsort(ious).tolist() if k in names and ious[k] < KNOWN_CLASS]
         if weak:
             warnings.append(
                 f"Of {counted(len(weak), 'class', 'classes')} masks and prediction overlap by less than half "
-                f"(IoU below {KNOWN_CLASS:g}): {_some(weak)}."
+                f"(IoU below {KNOWN_CLASS:g}): {listed(weak, NOTED)}."
             )
     total = max(report["scene"]["gaussians"], 1)
     if gaussians["unobserved"] > 0.02 * total:
@@ -149,8 +143,3 @@ def warnings_of(report: Mapping[str, Any], ious: np.ndarray | None) -> list[str]
             "neighbour that was; they belong to nothing."
         )
     return warnings
-
-
-def _some(names: Sequence[str]) -> str:
-    more = len(names) - NOTED
-    return ", ".join(names[:NOTED]) + (f" and {more} more" if more > 0 else "")

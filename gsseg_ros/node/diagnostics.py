@@ -7,7 +7,9 @@ from collections import Counter
 
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 
+from gsseg_core.learn.renamed_ids import renamed_note
 from gsseg_core.live.results import SCENE_CHANGED
+from gsseg_core.live.session import LiveSession
 from gsseg_core.text import counted
 from gsseg_ros.node.complaints import CLOCK, MISSING, NAMESAKES, PERIOD, TIME_JUMP, Complaints
 from gsseg_ros.node.inputs import Inputs
@@ -73,6 +75,11 @@ def namesakes(inputs: Inputs) -> str:
         f"{found} this node's name: a request is worked on by each, and answered by the first; expected names of their "
         "own (--ros-args -r __node:=... or __ns:=...); one that was killed is forgotten within a minute"
     )
+
+
+def renamed_ids_of(session: LiveSession) -> str:
+    """Say which ids name one object, as far as what was learnt tells, and what to do; empty if none does."""
+    return renamed_note(session.renamed, "The parameter ids set to per-view", "label_map")
 
 
 def why_dropped(inputs: Inputs, reason: str) -> str:
@@ -169,7 +176,7 @@ def diagnostic_array(
 
     Its level is OK while masks are fused; WARN if something is amiss that may cost views: not active, no scene, no
     clock, silent inputs, refused poses or scene changes, another node of this name, a tenth or more of the masks of the
-    last ten seconds refused; ERROR if all of these masks were refused, three at least.
+    last ten seconds refused; also if ids name one object; ERROR if all of these masks were refused, three at least.
     """
     recent = _recent(inputs) if inputs is not None else Counter[str]()
     level, message = _verdict(workspace, inputs, recent, clock_problem)
@@ -205,7 +212,7 @@ def _verdict(
         return DiagnosticStatus.WARN, clock_problem
     if inputs is None or not workspace.active:
         return DiagnosticStatus.WARN, "not active"
-    if workspace.loaded is None:
+    if (session := workspace.loaded) is None:
         return DiagnosticStatus.WARN, "no scene is loaded"
     refused = recent.total() - recent[_ACCEPTED]
     if refused and refused >= WARN_SHARE * recent.total():
@@ -219,6 +226,8 @@ def _verdict(
         return DiagnosticStatus.WARN, next(iter(complaints.values()))
     if others := namesakes(inputs):
         return DiagnosticStatus.WARN, others
+    if renamed := renamed_ids_of(session):
+        return DiagnosticStatus.WARN, renamed
     return DiagnosticStatus.OK, "fusing"
 
 

@@ -19,6 +19,7 @@ from gsseg_core.live.results import Outcome
 from gsseg_core.live.session import LiveSession
 from gsseg_core.refine.settings import UNREFINED
 from gsseg_ros.errors import CanceledError, InvalidRequestError, NotActiveError, error_code
+from gsseg_ros.node.diagnostics import renamed_ids_of
 from gsseg_ros.node.jobs import Job
 from gsseg_ros.node.outputs import Outputs
 from gsseg_ros.node.reports import Selection, finish, report_message
@@ -112,6 +113,8 @@ class LearnAction:
             if session.version != version:
                 self._show()
             raise
+        if note := renamed_ids_of(session):
+            self._node.get_logger().warning(note)
         self._workspace.number(run)
         result.num_steps, result.converged, result.loss = outcome.num_steps, outcome.converged, outcome.loss
         result.report = self._report(session, outcome, run)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import functools
 import json
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -107,6 +107,13 @@ def wrong_views(count: int = 8, *, seed: int = 0, missed: float = 0.2, swapped: 
                 labels[truth == k] = k % 3 + 1
         views.append(View.from_arrays(view.camera, labels))
     return views
+
+
+def lost_half_way(views: Sequence[View]) -> list[View]:
+    """In the later half, each object has another id, as where a tracker lost it and named it anew."""
+    labels = [view.read_labels() + NUM_CLASSES * (view.read_labels() > 0) for view in views[len(views) // 2 :]]
+    later = [View.from_arrays(view.camera, one) for view, one in zip(views[len(views) // 2 :], labels, strict=True)]
+    return [*views[: len(views) // 2], *later]
 
 
 def with_clutter(view: View, label: int = 3) -> View:

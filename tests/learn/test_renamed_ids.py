@@ -3,12 +3,20 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
 import pytest
-from small_scenes import NUM_CLASSES, balls_on_a_table, clean_views, taught, write_dataset, wrong_views
+from small_scenes import (
+    NUM_CLASSES,
+    balls_on_a_table,
+    clean_views,
+    fed,
+    lost_half_way,
+    taught,
+    write_dataset,
+    wrong_views,
+)
 
 from gsseg_core.cli.main import main
 from gsseg_core.data.dataset import Dataset
@@ -17,6 +25,7 @@ from gsseg_core.data.view import View
 from gsseg_core.learn.em.em_learner import EMLearner
 from gsseg_core.learn.mask_reliability import ViewCheck, check_views
 from gsseg_core.learn.renamed_ids import renamed_ids
+from gsseg_core.live.session import LiveSession
 
 
 def check(classes: list[int], counts: dict[tuple[int, int], int]) -> ViewCheck:
@@ -25,13 +34,6 @@ def check(classes: list[int], counts: dict[tuple[int, int], int]) -> ViewCheck:
     for cell, count in counts.items():
         table[cell] = count
     return ViewCheck("view", int(table.sum()), np.array(classes, np.int32), table)
-
-
-def lost_half_way(views: Sequence[View]) -> list[View]:
-    """In the later half, each object has another id."""
-    labels = [view.read_labels() + NUM_CLASSES * (view.read_labels() > 0) for view in views[len(views) // 2 :]]
-    later = [View.from_arrays(view.camera, one) for view, one in zip(views[len(views) // 2 :], labels, strict=True)]
-    return [*views[: len(views) // 2], *later]
 
 
 def found_in(views: list[View]) -> dict[int, int]:
@@ -54,6 +56,20 @@ def test_what_one_mask_shows_together_is_two_objects() -> None:
     assert renamed_ids(apart) == {1: 2}
     together = check([1, 2, 3], {(1, 0): 1, (2, 1): 1, (3, 2): 1})
     assert renamed_ids([*apart, together]) == {}
+
+
+def test_a_session_finds_them_by_the_masks_that_it_samples_and_asks_all_masks_what_they_show_together() -> None:
+    views = lost_half_way(clean_views(40))
+    session = fed(LiveSession(balls_on_a_table()[0]), views)
+    assert session.renamed == []
+    session.learn("votes")
+    assert session.renamed == []
+    session.learn("em")
+    pairs = [{int(name[-2:]) for name in entry.values()} for entry in session.renamed]
+    assert len(pairs) >= 2 and all(pair in [{k, k + NUM_CLASSES} for k in range(1, NUM_CLASSES)] for pair in pairs)
+    checks = [check([1], {(2, 0): 9}), check([1], {(2, 0): 9}), check([2], {(2, 0): 1})]
+    assert renamed_ids(checks, [np.array([[-1, 1, 7]])]) == {1: 2}
+    assert renamed_ids(checks, [np.array([[2, 1, 7]])]) == {}
 
 
 def test_what_a_single_view_shows_or_the_background_takes_is_not_found() -> None:

@@ -166,7 +166,7 @@ class Hears:
     def verdict(self, clock_problem: str = "") -> tuple[bytes, str]:
         scene = type("Scene", (list,), {"path": "scene.ply"})()
         session = SimpleNamespace(
-            learnt=None, scene=scene, class_names={}, has_codes=False, num_fused=0, num_views=0, version=0
+            learnt=None, scene=scene, class_names={}, renamed=[], has_codes=False, num_fused=0, num_views=0, version=0
         )
         workspace: Any = SimpleNamespace(
             active=True,

@@ -11,7 +11,7 @@ from ros_fixtures import parameters_fixture, root_fixture  # noqa: F401
 from ros_helpers import Ros, ros_fixture, wait_until  # noqa: F401
 from ros_node_here import NodeHere, node_here
 from ros_robot import LATCHED
-from small_scenes import clean_views
+from small_scenes import clean_views, lost_half_way
 
 pytest.importorskip("gsseg_msgs.msg", reason="gsseg_msgs is not installed")
 
@@ -20,7 +20,7 @@ from gsseg_msgs.msg import ObjectArray
 from rclpy.parameter import Parameter
 from sensor_msgs.msg import PointCloud2
 
-from gsseg_ros.node import live_outputs, services
+from gsseg_ros.node import diagnostics, live_outputs, services
 from gsseg_ros.node.reports import Selection
 
 SIDES = ("left", "right")
@@ -52,10 +52,10 @@ def segment(here: NodeHere) -> None:
     here.done("segment")
 
 
-def learn(here: NodeHere) -> None:
+def learn(here: NodeHere, learner: str = "votes") -> None:
     ended: list[str] = []
     goal = SimpleNamespace(
-        request=Learn.Goal(learner="votes"), is_active=True, is_cancel_requested=False,
+        request=Learn.Goal(learner=learner), is_active=True, is_cancel_requested=False,
         publish_feedback=lambda message: None, succeed=lambda: ended.append("succeeded"), abort=lambda: None,
     )  # fmt: skip
     here.node._learn._execute(goal)
@@ -105,3 +105,33 @@ def test_what_is_picked_in_is_rectified_where_the_topics_of_the_cameras_say_so(
     with node_here(ros, {**parameters, "cameras": list(SIDES)}, [f"{side}/mask:={topic}" for side in SIDES]) as here:
         here.ask("pick")
     assert found == [rectified]
+
+
+def test_ids_that_a_tracker_gave_anew_are_said_once_in_the_log_and_in_diagnostics_until_they_are_forgotten(
+    ros: Ros, parameters: dict[str, Any], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    lines: list[str] = []
+    with node_here(ros, {key: value for key, value in parameters.items() if key != "class_names"}) as here:
+        monkeypatch.setattr(here.node, "get_logger", lambda: SimpleNamespace(warning=lines.append, info=str))
+
+        def verdict() -> str:
+            status = diagnostics.diagnostic_array(
+                "gsseg", here.node.workspace, here.inputs, here.node._sim_time.stamp()
+            )
+            return str(status.status[0].message)
+
+        here.fuse(lost_half_way(clean_views(12)))
+        learn(here)
+        assert (lines, verdict()) == ([], "fusing")
+        learn(here, "em")
+        (line,) = lines
+        assert verdict() == line
+        assert line.startswith("other views call ") and "by another that no mask shows beside it: class_" in line
+        assert line.endswith("The parameter ids set to per-view finds objects whatever their ids are, and label_map "
+                             "puts names together")  # fmt: skip
+        here.node.trigger_deactivate()
+        here.node.trigger_activate()
+        assert verdict() == line
+        here.done("reset")
+        assert verdict() == "fusing"
+    assert lines == [line]
