@@ -81,7 +81,7 @@ class MissingFileError(GssegError):
 
 
 # The first that fits counts. Every other error of the core is about a file.
-_NAMES: tuple[tuple[type[GssegError], str], ...] = (
+NAMES: tuple[tuple[type[GssegError], str], ...] = (
     (NotActiveError, "NOT_ACTIVE"),
     (BusyError, "BUSY"),
     (CanceledError, "CANCELED"),
@@ -102,17 +102,19 @@ _NAMES: tuple[tuple[type[GssegError], str], ...] = (
 )
 
 
+def kind_of(error: Exception) -> str:
+    """Return the name of the constant of answers for an error; UNKNOWN for one that was not foreseen."""
+    return next((name for kind, name in NAMES if isinstance(error, kind)), "UNKNOWN")
+
+
 def error_code(error: Exception, interface: Any) -> int:
     """Return the constant of an answer (a Response or Result class) for an error; its UNKNOWN where none fits."""
-    for kind, name in _NAMES:
-        if isinstance(error, kind):
-            return int(getattr(interface, name, interface.UNKNOWN))
-    return int(interface.UNKNOWN)
+    return int(getattr(interface, kind_of(error), interface.UNKNOWN))
 
 
 def error_name(code: int, interface: Any) -> str:
     """Return the name of an answer's error code (a Response or Result class); "UNKNOWN" for one that has none."""
-    for _, name in _NAMES:
+    for _, name in NAMES:
         if getattr(interface, name, None) == code:
             return name
     return "UNKNOWN"

@@ -7,6 +7,8 @@ import time
 from collections.abc import Callable
 from dataclasses import dataclass
 
+from gsseg_ros.errors import NAMES
+
 PERIOD = 5.0  # s
 
 MISSING = {role: f"no data on {role}" for role in ("mask", "camera_info", "depth", "pose", "odometry", "detections")}
@@ -27,7 +29,7 @@ REASONS = (
 _OTHER_KINDS = (
     REFUSED_POSE, TIME_JUMP, CLOCK, LIVE, OBSTACLES, SCENE_DELTA, NAMESAKES, REFUSED_LABELS, DETECTIONS_TYPE, OTHER,
 )  # fmt: skip
-KINDS = frozenset((*MISSING.values(), *REASONS, *_OTHER_KINDS))
+KINDS = frozenset((*MISSING.values(), *REASONS, *_OTHER_KINDS, *(name for _, name in NAMES)))
 
 
 @dataclass

@@ -10,7 +10,6 @@ from gsseg_msgs.action import Learn
 from gsseg_msgs.msg import SegmentationReport
 from rclpy.action.server import ActionServer, CancelResponse, GoalResponse, ServerGoalHandle
 from rclpy.callback_groups import ReentrantCallbackGroup
-from rclpy.lifecycle import LifecycleNode
 from std_msgs.msg import Header
 
 from gsseg_core.data.dataset import Dataset
@@ -18,13 +17,13 @@ from gsseg_core.learn.registry import LEARNERS
 from gsseg_core.live.results import Outcome
 from gsseg_core.live.session import LiveSession
 from gsseg_core.refine.settings import UNREFINED
-from gsseg_ros.errors import CanceledError, InvalidRequestError, NotActiveError, error_code
+from gsseg_ros.errors import CanceledError, InvalidRequestError, NotActiveError, error_code, kind_of
 from gsseg_ros.node.diagnostics import renamed_ids_of
 from gsseg_ros.node.jobs import Job
 from gsseg_ros.node.outputs import Outputs
 from gsseg_ros.node.reports import Selection, finish, report_message
-from gsseg_ros.node.services import explain
-from gsseg_ros.node.workspace import Run, Workspace
+from gsseg_ros.node.services import Services, explain
+from gsseg_ros.node.workspace import Run
 from gsseg_ros.qos import FEEDBACK_DEPTH, reliable
 
 FEEDBACK_PERIOD = 0.1
@@ -43,12 +42,10 @@ class LearnAction:
     learnt nothing; objects of ids per-view that it had repaired by then stay so, and are shown as after a view.
     """
 
-    def __init__(
-        self, node: LifecycleNode, workspace: Workspace, outputs: Callable[[], Outputs], show: Callable[[], None]
-    ) -> None:
-        self._node, self._workspace, self._outputs, self._show = node, workspace, outputs, show
+    def __init__(self, services: Services, outputs: Callable[[], Outputs]) -> None:
+        self._services, self._workspace, self._outputs = services, services.workspace, outputs
         self._server = ActionServer(
-            node,
+            services.node,
             Learn,
             "~/learn",
             self._execute,
@@ -66,7 +63,7 @@ class LearnAction:
         try:
             self._workspace.require_active()
         except NotActiveError as error:
-            self._node.get_logger().warning(f"a goal of learn is rejected: {error}")
+            self._services.complaints.add(kind_of(error), f"a goal of learn is rejected: {error}")
             return GoalResponse.REJECT
         return GoalResponse.ACCEPT
 
@@ -78,7 +75,7 @@ class LearnAction:
                 self._learn(goal, job, run, result)
             goal.succeed()
         except Exception as error:
-            result = Learn.Result(error_code=error_code(error, Learn.Result), error_msg=explain(self._node, error))
+            result = Learn.Result(error_code=error_code(error, Learn.Result), error_msg=explain(self._services, error))
             if isinstance(error, CanceledError) and goal.is_cancel_requested:
                 goal.canceled()
             else:
@@ -111,10 +108,10 @@ class LearnAction:
             )
         except Exception:
             if session.version != version:
-                self._show()
+                self._services.show()
             raise
         if note := renamed_ids_of(session):
-            self._node.get_logger().warning(note)
+            self._services.node.get_logger().warning(note)
         self._workspace.number(run)
         result.num_steps, result.converged, result.loss = outcome.num_steps, outcome.converged, outcome.loss
         result.report = self._report(session, outcome, run)
@@ -143,7 +140,7 @@ class LearnAction:
             if newest:
                 outputs.publish_objects(objects)
         if session.version != version:  # Views that came meanwhile are not in these objects.
-            self._show()
+            self._services.show()
         report = report_message(run, selection, UNREFINED, settings.map_frame)
         if outcome.rejected:
             reasons = sorted(set(outcome.rejected.values()))

@@ -7,6 +7,7 @@ import re
 import time
 from collections.abc import Callable, Container
 from dataclasses import replace
+from functools import partial
 from typing import TypeAlias
 
 from gsseg_msgs.msg import SceneDelta as SceneDeltaMessage
@@ -18,6 +19,7 @@ from gsseg_core.live.living_session import Changed, LivingSession
 from gsseg_core.scene.scene_delta import SceneDelta
 from gsseg_ros.delta_messages import delta_from_message
 from gsseg_ros.errors import InvalidRequestError
+from gsseg_ros.node.complaints import SCENE_DELTA
 from gsseg_ros.node.pairing import CAMERAS_KEPT
 from gsseg_ros.node.services import Services, answered, explain, in_turn
 from gsseg_ros.qos import reliable
@@ -31,16 +33,15 @@ _Key: TypeAlias = tuple[str, ...]
 class SceneChanges:
     """Creates the services and the subscription, and answers them.
 
-    What is wrong with a message of the topic goes to the log, by `complain`, and to /diagnostics, and changes nothing.
+    What is wrong with a message of the topic goes to the log and to /diagnostics, and changes nothing.
     A learn job need not be canceled: what it learns is carried over to the scene as it is then. `await_fused` waits
     until masks of some stamps that have come are fused: a change may name keyframes that are just under way.
     """
 
-    def __init__(
-        self, services: Services, complain: Callable[[str], None], await_fused: Callable[[set[str]], None]
-    ) -> None:
+    def __init__(self, services: Services, await_fused: Callable[[set[str]], None]) -> None:
         self.node, self.workspace, self.turns = services.node, services.workspace, services.turns
-        self._complain, self._show, self._await_fused = complain, services.show, await_fused
+        self.complaints, self._services, self._await_fused = services.complaints, services, await_fused
+        self._complain = partial(services.complaints.add, SCENE_DELTA)
         group = ReentrantCallbackGroup()
         for interface, name, handler in (
             (UpdateScene, "update_scene", self.update_scene),
@@ -79,7 +80,7 @@ class SceneChanges:
         except Exception as error:
             self.workspace.changes["refused"] += 1
             # What was not foreseen is logged with its traceback, too.
-            why = str(error) if isinstance(error, GssegError) else explain(self.node, error)
+            why = str(error) if isinstance(error, GssegError) else explain(self._services, error)
             message = f"topic scene_delta: {why.removeprefix('scene delta: ')}"
             self.workspace.refused_change = (time.monotonic(), message)
             self._complain(message)
@@ -95,7 +96,7 @@ class SceneChanges:
         with workspace.slot.take("merge_states"), workspace.run("merge_states"):
             self._require_current(session)
             response.num_merged = session.merge(paths, workspace.root)
-            self._show()
+            self._services.show()
             response.num_views, response.class_names = session.num_fused, list(session.class_names.values())
 
     def _update(self, session: LivingSession, delta: SceneDelta) -> Changed:
@@ -111,7 +112,7 @@ class SceneChanges:
             raise InvalidRequestError(str(error)) from error
         self._require_current(session)
         self.workspace.count(changed)
-        self._show()
+        self._services.show()
         return changed
 
     def _require_current(self, session: LivingSession) -> None:

@@ -24,7 +24,7 @@ from gsseg_core.freed_memory import end_without_a_search, keep_freed_memory
 from gsseg_core.live.living_session import LivingSession
 from gsseg_core.warm_up import warm_up
 from gsseg_ros.node import declarations, diagnostics, parameters
-from gsseg_ros.node.complaints import SCENE_DELTA, Complaints
+from gsseg_ros.node.complaints import Complaints
 from gsseg_ros.node.inputs import Inputs
 from gsseg_ros.node.learn_action import LearnAction
 from gsseg_ros.node.node_executor import NodeExecutor
@@ -80,13 +80,13 @@ class SegmentNode(LifecycleNode):
         self._out_of_place = False  # Whether what is latched is from where the scene lay before.
         self.workspace.placement.settled = self._publish_again
         self.workspace.placement.refused = self.get_logger().warning
-        self._requests = Services(self, self.workspace, self._require_outputs, self._lookup, self._show_change)
-        self._changes = SceneChanges(
-            self._requests, lambda message: self._complaints.add(SCENE_DELTA, message), self._await_fused
-        )
-        self._learn = LearnAction(self, self.workspace, self._require_outputs, self._show_change)
-        self._diagnostics = self.create_publisher(DiagnosticArray, "/diagnostics", 10)
         self._complaints = Complaints(self.get_logger().warning)
+        self._requests = Services(
+            self, self.workspace, self._complaints, self._require_outputs, self._lookup, self._show_change
+        )
+        self._changes = SceneChanges(self._requests, self._await_fused)
+        self._learn = LearnAction(self._requests, self._require_outputs)
+        self._diagnostics = self.create_publisher(DiagnosticArray, "/diagnostics", 10)
         self._sim_time = SimTime(self)
         # In a group of its own, since it may wait for the session. That /clock does not come, it may have to tell.
         steady_timer(self, 1.0, self._tell, MutuallyExclusiveCallbackGroup())

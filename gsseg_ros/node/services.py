@@ -29,7 +29,8 @@ from gsseg_core.scene.scene_writers import check_format
 from gsseg_core.segmentation import Segmentation
 from gsseg_core.text import one_line
 from gsseg_ros.camera_infos import is_rectified
-from gsseg_ros.errors import InvalidRequestError, error_code
+from gsseg_ros.errors import InvalidRequestError, error_code, kind_of
+from gsseg_ros.node.complaints import Complaints
 from gsseg_ros.node.jobs import Turns
 from gsseg_ros.node.output_folders import pinned_folder, require_own_folder, staged_export
 from gsseg_ros.node.outputs import Outputs
@@ -66,7 +67,7 @@ def answered(handler: Handler) -> Callable[..., Any]:
         except Exception as error:
             response = type(response)()  # Nothing half filled in goes out.
             response.error_code = error_code(error, type(response))
-            response.error_msg = explain(self.node, error)
+            response.error_msg = explain(self, error)
         return response
 
     return answer
@@ -84,12 +85,12 @@ def in_turn(handler: Handler) -> Handler:
     return work
 
 
-def explain(node: LifecycleNode, error: Exception) -> str:
+def explain(services: Services, error: Exception) -> str:
     """Log what went wrong, and say it in one line; what was not foreseen is logged with its traceback."""
     if isinstance(error, GssegError):
-        node.get_logger().warning(str(error))
+        services.complaints.add(kind_of(error), str(error))  # Clients may ask again and again until it is otherwise.
         return str(error)
-    node.get_logger().error(describe(error))
+    services.node.get_logger().error(describe(error))
     return one_line(f"{_unforeseen(error)}; the node's log has the details")
 
 
@@ -117,11 +118,12 @@ class Services:
         self,
         node: LifecycleNode,
         workspace: Workspace,
+        complaints: Complaints,
         outputs: Callable[[], Outputs],
         lookup: Callable[[], Lookup | None],
         show: Callable[[], None],
     ) -> None:
-        self.node, self.workspace, self.show = node, workspace, show
+        self.node, self.workspace, self.complaints, self.show = node, workspace, complaints, show
         self.turns = Turns(AT_WORK, WAITING)
         self._outputs, self._lookup = outputs, lookup
         # Reentrant: a request must not wait for another one to be answered.

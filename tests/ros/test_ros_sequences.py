@@ -17,6 +17,7 @@ pytest.importorskip("gsseg_msgs.msg", reason="gsseg_msgs is not installed")
 
 from gsseg_msgs.action import Learn
 from gsseg_msgs.msg import ObjectArray
+from rclpy.action.server import GoalResponse
 from rclpy.parameter import Parameter
 from sensor_msgs.msg import PointCloud2
 
@@ -94,6 +95,22 @@ def test_topics_of_two_cameras_can_be_exchanged_by_remapping(ros: Ros, parameter
             assert images._subscription is not None
             heard = [images._subscription, detections._listen(PointCloud2, lambda topic, message: None)]
             assert [one._subscription.topic_name for one in heard] == [f"/{other}/image", f"/{other}/found"]
+
+
+def test_a_node_that_is_asked_again_and_again_what_it_cannot_answer_yet_says_so_once_in_its_log(
+    ros: Ros, parameters: dict[str, Any], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    lines: list[str] = []
+    with node_here(ros, parameters) as here:
+        monkeypatch.setattr(here.node._complaints, "_warn", lines.append)
+        monkeypatch.setattr(here.node._complaints, "_now", lambda: 100.0)
+        for said in ("no view has been fused", "the node is not active"):
+            answers = {here.ask(service).error_msg for service in ("segment", "save_state", "segment", "segment")}
+            assert any(answer.startswith(said) for answer in answers)
+            rejected = here.node._learn._welcome(Learn.Goal()) == GoalResponse.REJECT
+            assert (len(lines), lines[-1].startswith(said), rejected) == (1, True, not here.node.workspace.active)
+            lines.clear()
+            here.node.stop()
 
 
 @pytest.mark.parametrize(("topic", "rectified"), [("/cam/image_rect/mask", True), ("/cam/image/mask", False)])
