@@ -349,6 +349,12 @@ class _CameraInfos(History[int, Any]):
         super().__init__(capacity)
         self.found = deque([True, True], 2)
 
+    def add(self, stamp: int, value: Any) -> None:
+        """Keep a camera_info; of two with the same stamp the later one, as a driver may leave all stamps at zero."""
+        super().add(stamp, value)
+        if stamp in self.values:
+            self.values[stamp] = value
+
 
 @dataclass
 class _Waiting:

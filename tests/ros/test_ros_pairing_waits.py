@@ -63,6 +63,15 @@ def test_where_camera_infos_are_rare_only_the_first_mask_waits_for_long() -> Non
     assert [p.camera_info for p in pairing.take()] == [f"info {1 * S}"]
 
 
+def test_of_camera_infos_whose_stamps_are_all_zero_the_last_one_serves() -> None:
+    pairing = Pairing(MessagePoses())
+    for second, info in enumerate(("small", "large"), start=1):
+        pairing.add_camera_info(0, info)
+        send(pairing, [("pose", second * S), ("mask", second * S)])
+        wait(pairing, 10.2)
+        assert [p.camera_info for p in pairing.take()] == [info]
+
+
 @pytest.mark.parametrize(("kind", "reason"), [("info", "no_camera_info"), ("pose", "no_pose")])
 def test_a_mask_is_given_up_once_what_it_waits_for_has_gone_on_by_a_second(kind: str, reason: str) -> None:
     pairing = Pairing(MessagePoses())
