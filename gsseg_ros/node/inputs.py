@@ -29,7 +29,7 @@ from gsseg_ros.node.jobs import Worker
 from gsseg_ros.node.live_outputs import LiveOutputs
 from gsseg_ros.node.masks.compressed import compressed_topic
 from gsseg_ros.node.masks.detections_input import DetectionsInput
-from gsseg_ros.node.masks.label_info import LabelInfoInput
+from gsseg_ros.node.masks.label_info import TOPIC, LabelInfoInput, label_info_class
 from gsseg_ros.node.masks.reader import MaskReader
 from gsseg_ros.node.matched_subscription import MatchedSubscription
 from gsseg_ros.node.outputs import Outputs
@@ -92,11 +92,12 @@ class Inputs:
         built.callback(self.live.close)
         compressed = settings.image_transport == "compressed"
         self._masks = MaskReader(settings, workspace.label_space, self._say_once)
-        self.label_info = LabelInfoInput(node, workspace.label_space, self._group, self._complaints)
-        built.callback(self.label_info.close)
+        self.label_info = LabelInfoInput(node, workspace.label_space, self._complaints)
         self.cameras: dict[str, CameraStreams] = {}  # by name; "" if there is only one
         self.detections: list[DetectionsInput] = []
         self._images: list[CameraImages] = []
+        if (kind := label_info_class()) is not None:  # It is not missed: names come once, if at all.
+            self._listen(built, kind, TOPIC, TOPIC, lambda _, names: self.label_info.on_label_info(names), False)
         # A simulator's stamps repeat, and views of an earlier activation may come back with a saved state.
         activation = secrets.token_hex(4)
         workspace.activations.add(activation)

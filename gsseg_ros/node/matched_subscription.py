@@ -26,6 +26,9 @@ LATCHED = "transient local"
 """How a durability is called of which one message may be all that ever comes."""
 
 _TRANSIENT_LOCAL = DurabilityPolicy.TRANSIENT_LOCAL
+_ONCE = {"CameraInfo": DurabilityPolicy.VOLATILE, "LabelInfo": _TRANSIENT_LOCAL}
+"""By class of which one latched message may be all that ever comes: what is assumed while there is no publisher."""
+
 _INT32, _UINT32 = 2**31 - 1, 2**32 - 1
 
 
@@ -33,10 +36,10 @@ class MatchedSubscription:
     """A subscription that is reliable while every publisher of its topic is, and best effort while one is not.
 
     What a best-effort stream loses is lost for good, and of large images that may be half; but a reliable subscription
-    hears no best-effort publisher. So it is made anew when the publishers have changed. Likewise, of camera_infos that
-    are all latched it gets those of before, too, and hears others while one is not. Where the parameter qos_overrides
-    says how reliable it is to be, it stays so. Raises `SettingsError`: its quality of service is overridden by
-    something impossible.
+    hears no best-effort publisher. So it is made anew when the publishers have changed. Likewise, of camera_infos, and
+    of names of labels, that are all latched it gets those of before, too, and hears others while one is not. Where the
+    parameter qos_overrides says how reliable it is to be, it stays so. Raises `SettingsError`: its quality of service
+    is overridden by something impossible.
     """
 
     def __init__(
@@ -104,8 +107,9 @@ class MatchedSubscription:
             reliable = all(offer.reliability == ReliabilityPolicy.RELIABLE for offer in offers)
             reliability = ReliabilityPolicy.RELIABLE if reliable else ReliabilityPolicy.BEST_EFFORT
         # Not of masks: those of before this node listened have no pose any more.
-        latched = self._kind is CameraInfo and {offer.durability for offer in offers} == {_TRANSIENT_LOCAL}
-        return reliability, _TRANSIENT_LOCAL if latched else DurabilityPolicy.VOLATILE
+        latched = {offer.durability for offer in offers} or {_ONCE.get(self._kind.__name__)}
+        once = self._kind.__name__ in _ONCE and latched == {_TRANSIENT_LOCAL}
+        return reliability, _TRANSIENT_LOCAL if once else DurabilityPolicy.VOLATILE
 
     def _count_lost(self, event: Any) -> None:
         # Of a large message that a later one has overtaken Fast DDS says besides that 2^31 - 1 are lost.

@@ -11,10 +11,10 @@ from typing import Any
 
 import numpy as np
 import pytest
-from ros_fixtures import parameters_fixture, root_fixture, scene_fixture, shared_fixture  # noqa: F401
+from ros_fixtures import parameters_fixture, root_fixture, scene_fixture, shared_fixture, spun  # noqa: F401
 from ros_helpers import Ros, wait_until
 from ros_node_here import NodeHere, node_here
-from ros_robot import core_session, messages
+from ros_robot import LATCHED, core_session, messages
 from small_scenes import clean_views
 
 from gsseg_core.data.view import View
@@ -24,8 +24,11 @@ pytest.importorskip("gsseg_msgs.msg", reason="gsseg_msgs is not installed")
 
 from rclpy.lifecycle import TransitionCallbackReturn
 from rclpy.parameter import Parameter
+from sensor_msgs.msg import CameraInfo
 
 from gsseg_ros.conversions import mask_image
+from gsseg_ros.node import inputs
+from gsseg_ros.node.masks import label_info
 from gsseg_ros.node.masks.detections import ADAPTERS, Detected
 
 NAMES = {0: "background", 1: "red ball", 2: "cup/mug", 3: "box"}
@@ -52,6 +55,29 @@ def tell(here: NodeHere, names: dict[int, str]) -> None:
     """Hand over a label_info."""
     entries = [Fields(class_id=k, class_name=name) for k, name in names.items()]
     here.inputs.label_info.on_label_info(Fields(class_map=entries))
+
+
+class LabelInfo(CameraInfo):
+    """Stands in for that of vision_msgs: with its name, and a width that is the number of the class "cup"."""
+
+
+@pytest.mark.parametrize("latched", [True, False])
+def test_label_info_is_heard_latched_from_before_and_otherwise(
+    shared: Ros, parameters: dict[str, Any], monkeypatch: pytest.MonkeyPatch, latched: bool
+) -> None:
+    monkeypatch.setattr(inputs, "label_info_class", lambda: LabelInfo)
+    monkeypatch.setattr(label_info, "names_of", lambda message, topic: {message.width: "cup"})
+    publisher = shared.node.create_publisher(CameraInfo, "label_info", LATCHED if latched else 1)
+    publisher.publish(CameraInfo(width=7))
+    with node(shared, parameters) as here, spun(here.node):
+
+        def heard() -> bool:
+            if not latched:
+                publisher.publish(CameraInfo(width=7))
+            return here.node.workspace.label_space.heard == {7: "cup"}
+
+        wait_until(heard, "the names of labels")
+    shared.node.destroy_publisher(publisher)
 
 
 def fuse(here: NodeHere, view: View, mask: Any = None) -> None:

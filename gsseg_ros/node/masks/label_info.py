@@ -8,9 +8,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
-from rclpy.callback_groups import CallbackGroup
 from rclpy.node import Node
-from rclpy.qos_overriding_options import QoSOverridingOptions
 from std_msgs.msg import Header
 
 from gsseg_core.data.class_names import flaw_of_class_name, listed
@@ -18,7 +16,6 @@ from gsseg_core.files.limits import MAX_LABEL
 from gsseg_ros.errors import LabelInfoError
 from gsseg_ros.node.complaints import REFUSED_LABELS, Complaints
 from gsseg_ros.node.masks.label_space import LabelSpace
-from gsseg_ros.qos import clear_overrides, latched
 
 TOPIC = "label_info"
 
@@ -60,21 +57,10 @@ def label_info(names: Mapping[int, str], header: Header) -> Any:
 
 
 class LabelInfoInput:
-    """Hears names of labels. It is none of the inputs that are missed: they come once, if at all."""
+    """Takes in names of labels."""
 
-    def __init__(self, node: Node, label_space: LabelSpace, group: CallbackGroup, complaints: Complaints) -> None:
+    def __init__(self, node: Node, label_space: LabelSpace, complaints: Complaints) -> None:
         self._node, self._label_space, self._complaints = node, label_space, complaints
-        self._subscription: Any = None
-        if (kind := label_info_class()) is not None:
-            with clear_overrides(TOPIC):
-                self._subscription = node.create_subscription(
-                    kind,
-                    TOPIC,
-                    self.on_label_info,
-                    latched(),
-                    callback_group=group,
-                    qos_overriding_options=QoSOverridingOptions.with_default_policies(),
-                )
 
     def on_label_info(self, message: Any) -> None:
         """Take in names."""
@@ -86,8 +72,3 @@ class LabelInfoInput:
             return
         if self._label_space.hear(names):
             self._node.get_logger().info(f"{topic}: labels are called {listed(names.values())}")
-
-    def close(self) -> None:
-        """Stop to listen."""
-        if self._subscription is not None:
-            self._node.destroy_subscription(self._subscription)
