@@ -114,7 +114,4 @@ def error_code(error: Exception, interface: Any) -> int:
 
 def error_name(code: int, interface: Any) -> str:
     """Return the name of an answer's error code (a Response or Result class); "UNKNOWN" for one that has none."""
-    for _, name in NAMES:
-        if getattr(interface, name, None) == code:
-            return name
-    return "UNKNOWN"
+    return next((name for _, name in NAMES if getattr(interface, name, None) == code), "UNKNOWN")

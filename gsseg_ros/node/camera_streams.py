@@ -39,10 +39,8 @@ def mask_class(settings: Settings) -> Any:
 def camera_of(paired: Paired, size: tuple[int, int], settings: Settings) -> Camera:
     """Make the scene's camera of a mask or picture of some size (width, height); raises as `camera_of_image` does."""
     (topic, _), (info_topic, info) = paired.mask, paired.camera_info
-    pose, rectified = (
-        settings.scene_to_map.world_to_camera(paired.pose),
-        is_rectified(settings.rectified, topic, info_topic),
-    )
+    pose = settings.scene_to_map.world_to_camera(paired.pose)
+    rectified = is_rectified(settings.rectified, topic, info_topic)
     return camera_of_image(paired.name, info, size, pose, topic, info_topic, rectified=rectified)
 
 

@@ -121,11 +121,8 @@ def complain(complaints: Complaints, inputs: Inputs | None, clock_problem: str) 
 
 
 def _complain_of_losses(complaints: Complaints, inputs: Inputs) -> None:
-    pairing, logged = (
-        max((camera.pairing for camera in inputs.cameras.values()), key=lambda p: p.time_jumps),
-        inputs.logged,
-    )
-    jumps = pairing.time_jumps
+    pairing = max((camera.pairing for camera in inputs.cameras.values()), key=lambda p: p.time_jumps)
+    logged, jumps = inputs.logged, pairing.time_jumps
     if jumps > logged[TIME_JUMP] and complaints.due(TIME_JUMP):
         before, after = (stamp / 1e9 for stamp in pairing.last_jump)
         times = f" {jumps - logged[TIME_JUMP]} times, the last time" * (jumps - logged[TIME_JUMP] > 1)

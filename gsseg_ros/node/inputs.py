@@ -83,12 +83,9 @@ class Inputs:
         self.worker: Worker[Paired] = Worker(self._fuse, settings.queue_size, lambda paired: paired.size, MOST_BYTES)
         built.callback(self.worker.stop)
         self.live = LiveOutputs(
-            workspace,
-            outputs,
-            lambda: self.worker.waiting > 0,
-            lambda: node.get_clock().now().to_msg(),
+            workspace, outputs, lambda: self.worker.waiting > 0, lambda: node.get_clock().now().to_msg(),
             partial(self._complaints.add, LIVE),
-        )
+        )  # fmt: skip
         built.callback(self.live.close)
         compressed = settings.image_transport == "compressed"
         self._masks = MaskReader(settings, workspace.label_space, self._say_once)

@@ -45,15 +45,10 @@ class LearnAction:
     def __init__(self, services: Services, outputs: Callable[[], Outputs]) -> None:
         self._services, self._workspace, self._outputs = services, services.workspace, outputs
         self._server = ActionServer(
-            services.node,
-            Learn,
-            "~/learn",
-            self._execute,
-            goal_callback=self._welcome,
-            cancel_callback=lambda goal: CancelResponse.ACCEPT,
-            callback_group=ReentrantCallbackGroup(),
+            services.node, Learn, "~/learn", self._execute, goal_callback=self._welcome,
+            cancel_callback=lambda goal: CancelResponse.ACCEPT, callback_group=ReentrantCallbackGroup(),
             feedback_pub_qos_profile=reliable(FEEDBACK_DEPTH),
-        )
+        )  # fmt: skip
 
     def close(self) -> None:
         """Take the action away."""

@@ -79,14 +79,9 @@ class MatchedSubscription:
         # No validation, but rclpy's only word between reading the overrides and subscribing.
         overridable = QoSOverridingOptions.with_default_policies(callback=self._match)
         create = partial(
-            self._node.create_subscription,
-            self._kind,
-            self._topic,
-            self._callback,
-            quality,
-            callback_group=self._group,
-            qos_overriding_options=overridable,
-        )
+            self._node.create_subscription, self._kind, self._topic, self._callback, quality,
+            callback_group=self._group, qos_overriding_options=overridable,
+        )  # fmt: skip
         events = partial(SubscriptionEventCallbacks, incompatible_qos=self._complain)
         with clear_overrides(self._topic):
             try:

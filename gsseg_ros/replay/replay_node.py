@@ -32,6 +32,9 @@ from gsseg_ros.shared_memory import make_room
 _CLASSES = {
     "mask": Image, "camera_info": CameraInfo, "pose": PoseStamped, "image": Image, "scene_delta": SceneDelta,
 }  # fmt: skip
+_KINDS = {
+    str: "a string", bool: "true or false", int: "a whole number", float: "a number with a decimal point",
+}  # fmt: skip
 _QOS = QoSProfile(depth=30, reliability=ReliabilityPolicy.RELIABLE)
 
 # Name, default, smallest, largest (of numbers), description.
@@ -140,12 +143,7 @@ class ReplayNode(Node):
                 self.declare_parameter(name, default, descriptor)
             except ParameterException as error:
                 limits = "" if low is None else f" from {low:g} to {high:g}"
-                kind = {
-                    str: "a string",
-                    bool: "true or false",
-                    int: "a whole number",
-                    float: "a number with a decimal point",
-                }[type(default)]
+                kind = _KINDS[type(default)]
                 reason = " ".join(str(error).split())
                 raise SettingsError(f"parameter '{name}': {reason}; expected {kind}{limits}") from None
         return {name: self.get_parameter(name).value for name, *_ in _PARAMETERS}
