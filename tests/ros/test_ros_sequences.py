@@ -141,6 +141,7 @@ def test_ids_that_a_tracker_gave_anew_are_said_once_in_the_log_and_in_diagnostic
         learn(here)
         assert (lines, verdict()) == ([], "fusing")
         learn(here, "em")
+        learn(here, "em")
         (line,) = lines
         assert verdict() == line
         assert line.startswith("other views call ") and "by another that no mask shows beside it: class_" in line
