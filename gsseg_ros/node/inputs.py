@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import secrets
 import threading
 import time
@@ -194,10 +195,10 @@ class Inputs:
     ) -> MatchedSubscription:
         """Subscribe until the stack is closed; without one, the caller closes the subscription."""
         topic = compressed_topic(self._node, topic) if kind is CompressedImage else topic
-        name = self._node.resolve_topic_name(topic)
+        name, numbers = self._node.resolve_topic_name(topic), itertools.count(1)  # Cameras may share the topic.
 
         def arrived(message: Any) -> None:
-            self.arrivals[name] = (self.arrivals[name][0] + 1, time.monotonic())
+            self.arrivals[name] = (next(numbers), time.monotonic())
             callback(name, message)
             self._hand_over()
 

@@ -17,6 +17,7 @@ pytest.importorskip("gsseg_msgs.msg", reason="gsseg_msgs is not installed")
 
 from gsseg_msgs.action import Learn
 from gsseg_msgs.msg import ObjectArray
+from nav_msgs.msg import Odometry
 from rclpy.action.server import GoalResponse
 from rclpy.parameter import Parameter
 from sensor_msgs.msg import PointCloud2
@@ -111,6 +112,16 @@ def test_a_node_that_is_asked_again_and_again_what_it_cannot_answer_yet_says_so_
             assert (len(lines), lines[-1].startswith(said), rejected) == (1, True, not here.node.workspace.active)
             lines.clear()
             here.node.stop()
+
+
+def test_an_odometry_of_two_cameras_is_counted_once(ros: Ros, parameters: dict[str, Any]) -> None:
+    values = {**parameters, "cameras": list(SIDES), "pose_source": "odometry"}
+    with node_here(ros, values, [f"{side}/odometry:=odom" for side in SIDES]) as here:
+        heard = [one for one in here.inputs._subscriptions if one.topic_name == "/odom"]
+        for _ in range(3):
+            for one in heard:
+                one._callback(Odometry())
+        assert (len(heard), here.inputs.arrivals["/odom"][0]) == (2, 3)
 
 
 @pytest.mark.parametrize(("topic", "rectified"), [("/cam/image_rect/mask", True), ("/cam/image/mask", False)])
