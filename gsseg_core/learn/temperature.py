@@ -132,13 +132,13 @@ def fit_temperature(samples: Sequence[Sample]) -> float:
     float
         In [`LOWEST`, `HIGHEST`]; 1 where there is no pixel to go by.
     """
-    samples = [sample for sample in samples if len(sample.seen)]
-    if not samples:
+    known = [_Cells.of(sample) for sample in samples if len(sample.seen)]
+    if not known:
         return 1.0
 
     def loss(log_temperature: float) -> float:
         temperature = float(np.exp(log_temperature))
-        return -sum(log_likelihood(sample, temperature) for sample in samples)
+        return -sum(_log_likelihood(cells, temperature) for cells in known)
 
     return float(np.exp(golden_section(loss, float(np.log(LOWEST)), float(np.log(HIGHEST)), _PRECISION)))
 
@@ -163,23 +163,45 @@ def golden_section(f: Callable[[float], float], low: float, high: float, precisi
     return (low + high) / 2
 
 
-def log_likelihood(sample: Sample, temperature: float) -> float:
+class _Cells(NamedTuple):
+    """What is not 0 of the probabilities of a sample, and the cells of its confusion matrix that this meets.
+
+    Of hundreds of classes, a pixel has a few, and a label is carried by pixels of a few.
+    """
+
+    shares: CSRRows  # P rows, Z entries in all
+    pixel: np.ndarray  # (Z,) int64: of each entry
+    cell: np.ndarray  # (Z,) int64: of the M cells
+    true: np.ndarray  # (M,) int64: class of each cell
+    right: np.ndarray  # (L,) int64: for each label that occurs, the cell of its own class
+    num_classes: int
+
+    @classmethod
+    def of(cls, sample: Sample) -> _Cells:
+        shares, num_classes = CSRRows.from_dense(sample.shares), sample.shares.shape[1]
+        present, label = np.unique(sample.seen, return_inverse=True)
+        pixel = np.repeat(np.arange(shares.num_rows), np.diff(shares.indptr))
+        met = shares.indices.astype(np.int64) * len(present) + label[pixel]
+        cells, place = np.unique(np.append(met, present * len(present) + np.arange(len(present))), return_inverse=True)
+        return cls(shares, pixel, place[: len(met)], cells // len(present), place[len(met) :], num_classes)
+
+
+def _log_likelihood(cells: _Cells, temperature: float) -> float:
     """Natural logarithm of the likelihood of a view's labels at a temperature, through its best confusion matrix."""
-    probabilities = tempered(sample.shares, temperature)
-    # Labels are ascending: pixels of one label are a block.
-    present, first, column = np.unique(sample.seen, return_index=True, return_inverse=True)
-    diagonal = present, np.arange(len(present))
-    right = RIGHT * probabilities.sum(axis=0)[present]
-    confusion = np.full((probabilities.shape[1], len(present)), (1 - RIGHT) / len(present))
-    confusion[diagonal] += RIGHT
-    confusion /= confusion.sum(axis=1, keepdims=True)
+    shares, pixel, cell, true, right, num_classes = cells
+    probabilities = tempered_rows(shares, temperature).data.astype(np.float64)
+    prior = RIGHT * np.bincount(shares.indices, probabilities, num_classes)[true[right]]
+    # Rows sum to 1; those of classes that no label means have nothing on the diagonal.
+    is_named = np.isin(true, true[right])
+    confusion = np.where(is_named, 1 - RIGHT, 1.0) / len(right)
+    confusion[right] += RIGHT
     for step in range(STEPS):
         confusion *= 1 - OUTLIERS
-        likelihood = np.einsum("pk,pk->p", confusion.T[column], probabilities) + OUTLIERS / len(present)
+        likelihood = np.bincount(pixel, confusion[cell] * probabilities, shares.num_rows) + OUTLIERS / len(right)
         likelihood = np.maximum(likelihood, _TINY)
         if step < STEPS - 1:
-            counts = confusion * np.add.reduceat(probabilities / likelihood[:, None], first, axis=0).T
-            counts[diagonal] += right
-            total = counts.sum(axis=1, keepdims=True)
+            counts = confusion * np.bincount(cell, probabilities / likelihood[pixel], len(true))
+            counts[right] += prior
+            total = np.bincount(true, counts, num_classes)[true]
             np.divide(counts, total, out=confusion, where=total > 0)
     return float(np.log(likelihood).sum())

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import tracemalloc
 from functools import cache
 from pathlib import Path
 
@@ -15,12 +16,16 @@ from small_scenes import NAMES, NUM_CLASSES, balls_on_a_table, ring, taught, wri
 from gsseg_core.data.label_images import UNKNOWN
 from gsseg_core.data.view import View
 from gsseg_core.export.class_files import export_classes
+from gsseg_core.learn import temperature as fitting
 from gsseg_core.learn.calibrate import calibrate
 from gsseg_core.learn.em.em_learner import EMLearner
 from gsseg_core.learn.learner import Learner
 from gsseg_core.learn.mask_reliability import MaskChecker
 from gsseg_core.learn.temperature import (
+    OUTLIERS,
     PIXELS,
+    RIGHT,
+    STEPS,
     Sample,
     fit_temperature,
     golden_section,
@@ -96,6 +101,53 @@ def test_names_of_the_classes_and_order_of_the_views_do_not_matter_to_the_temper
     samples = [as_sample(one, labels) for one, labels in zip(right, seen, strict=True)]
     renamed = [as_sample(one[:, np.argsort(place)], place[labels]) for one, labels in zip(right, seen, strict=True)]
     assert fit_temperature(renamed[::-1]) == pytest.approx(fit_temperature(samples), rel=1e-3)
+
+
+def slow_log_likelihood(sample: Sample, temperature: float) -> float:
+    """The equations of the module, with confusion matrices of all classes and labels."""
+    probabilities, present = tempered(sample.shares, temperature).astype(float), np.unique(sample.seen)
+    carries = sample.seen[:, None] == present  # (P, L)
+    diagonal, confusion = (present, np.arange(len(present))), np.ones((probabilities.shape[1], len(present)))
+    confusion *= (1 - RIGHT) / len(present)
+    confusion[diagonal] += RIGHT
+    confusion /= confusion.sum(axis=1, keepdims=True)
+    for step in range(STEPS):
+        likelihood = (probabilities @ ((1 - OUTLIERS) * confusion) * carries).sum(axis=1) + OUTLIERS / len(present)
+        if step < STEPS - 1:
+            counts = (1 - OUTLIERS) * confusion * (probabilities.T @ (carries / likelihood[:, None]))
+            counts[diagonal] += RIGHT * probabilities.sum(axis=0)[present]
+            total = counts.sum(axis=1, keepdims=True)
+            confusion = np.where(total > 0, counts / np.where(total > 0, total, 1), confusion)
+    return float(np.log(likelihood).sum())
+
+
+def pixels_of_a_few_classes_each(num_classes: int) -> Sample:
+    rng = np.random.default_rng(0)
+    first = rng.integers(0, num_classes, 2_000)
+    shares = np.zeros((len(first), num_classes), np.float32)
+    shares[np.arange(len(first)), first] = 0.75
+    shares[np.arange(len(first)), (first + 1) % num_classes] += 0.25
+    return as_sample(shares, np.where(rng.random(len(first)) < 0.2, (first + 2) % num_classes, first))
+
+
+@pytest.mark.parametrize("num_classes", [1, 3, 40, 1_500])
+def test_the_likelihood_of_a_temperature_is_that_of_the_equations_also_where_classes_or_labels_lack(
+    num_classes: int,
+) -> None:
+    sample = pixels_of_a_few_classes_each(num_classes)
+    for temperature in (0.2, 1.0, 5.0):
+        found = fitting._log_likelihood(fitting._Cells.of(sample), temperature)
+        assert found == pytest.approx(slow_log_likelihood(sample, temperature), rel=1e-6)
+
+
+def test_a_temperature_takes_memory_by_what_pixels_show_however_many_classes_a_view_has() -> None:
+    samples = [pixels_of_a_few_classes_each(1_500)]
+    fit_temperature(samples)  # Whoever does so first in a process loads what it takes.
+    tracemalloc.start()
+    fit_temperature(samples)
+    peak = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    assert peak < 2**22, "a table of all classes by all labels takes 18 MB"
 
 
 def test_nothing_to_go_by_leaves_probabilities_as_they_are() -> None:
