@@ -101,6 +101,15 @@ class LabelEvidence:
         return np.column_stack([self.mass, self.rest]) if self.has_none_of_these else self.mass
 
     @cached_property
+    def only_words(self) -> np.ndarray | None:
+        """Position of the one word that each label can mean, (L,) int64; None where one of them can mean several."""
+        plausible = self.word_plausibility
+        if plausible is None:
+            return np.arange(len(self.classes))
+        alone = (plausible.max(axis=1, initial=0) == 1) & (np.count_nonzero(plausible, axis=1) == 1)
+        return plausible.argmax(axis=1) if (alone & self.informative).all() else None
+
+    @cached_property
     def votes(self) -> CSRRows:
         """Votes of a pixel of each label: the mass of a class, less the rest if it was looked for; float64."""
         if self.mass is None:

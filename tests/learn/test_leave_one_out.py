@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import tracemalloc
+
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -11,6 +13,7 @@ from small_scenes import NUM_CLASSES, balls_on_a_table, clean_views
 from gsseg_core.csr_rows import CSRRows
 from gsseg_core.data.label_evidence import UNITS, LabelEvidence
 from gsseg_core.data.view import View
+from gsseg_core.learn.em import em_kernels
 from gsseg_core.learn.em.em_kernels import leave_one_out_counts
 from gsseg_core.learn.em.em_learner import EMLearner
 from gsseg_core.learn.vote_resolution import resolved_votes
@@ -61,6 +64,23 @@ def test_counts_by_the_others_are_those_of_a_slow_twin(seed: int, power: float, 
     evidence = observation.evidence.without_names(rng.random(len(observation.classes)) < 0.3)
     found = leave_one_out_counts(CSRRows.from_dense(votes), observation, POSSIBLE, evidence, power, most)
     np.testing.assert_allclose(found, slow_count(votes, observation, evidence, power, most), rtol=1e-4, atol=1e-4)
+
+
+def test_counts_of_thousands_of_classes_are_the_same_and_take_memory_for_a_few_tables(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    views = clean_views(3)
+    learner, observation = observed(views, views[1].name)
+    votes, many = learner._votes.rows(), np.arange(60_000) < NUM_CLASSES
+    few = leave_one_out_counts(votes, observation, POSSIBLE, observation.evidence, 4.0)
+    monkeypatch.setattr(em_kernels, "_AT_ONCE", 3 * len(many) * len(observation.classes))
+    tracemalloc.start()
+    found = leave_one_out_counts(votes, observation, many, observation.evidence, 4.0)
+    peak = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    assert peak < 6 * found.nbytes, "one for each of 16 blocks would be 17"
+    np.testing.assert_array_equal(found[:NUM_CLASSES], few)
+    assert few.any() and not found[NUM_CLASSES:].any()
 
 
 @pytest.mark.parametrize("looked_for", [[1], [1, 2], [2, 3]])

@@ -11,10 +11,12 @@ from scipy import ndimage
 from small_scenes import NUM_CLASSES, balls_on_a_table, clean_views, mean_iou, taught, with_clutter
 
 from gsseg_core.csr_rows import CSRRows
+from gsseg_core.data.label_evidence import LabelEvidence
 from gsseg_core.data.label_images import UNKNOWN
 from gsseg_core.data.soft_masks import SeenLabels
 from gsseg_core.data.view import View
 from gsseg_core.errors import SettingsError
+from gsseg_core.learn.em.confusion_model import ErrorModel
 from gsseg_core.learn.em.em_learner import EMLearner, EMSettings
 from gsseg_core.learn.em.rejected_regions import MOST, SMALLEST, connected_pixels, find_rejected, split_regions
 from gsseg_core.learn.vote_learner import VoteLearner
@@ -55,6 +57,27 @@ def test_regions_mean_what_the_labels_were_and_only_large_ones_stand_alone(label
     assert all(len(region) == 1 for region in alone)
     assert len(np.unique(alone)) == len(large)
     assert len(seen.evidence.informative) <= len(large) + 3
+
+
+def test_regions_of_one_word_each_need_no_product_of_matrices() -> None:
+    rng = np.random.default_rng(0)
+    labels = np.kron(rng.integers(0, 6, (8, 8)), np.ones((12, 12), int)).astype(np.int32)
+    evidence = split_regions(SeenLabels(labels)).evidence
+    assert evidence is not None and len(evidence.informative) > 20
+    evidence = evidence.without_names(rng.random(len(evidence.informative)) < 0.3)
+    only, plausible = evidence.only_words, evidence.word_plausibility
+    assert only is not None and plausible is not None
+    np.testing.assert_array_equal(np.eye(plausible.shape[1])[only], plausible)
+    counts = rng.random((6, len(only)))
+    model = ErrorModel.from_counts(evidence, counts, 0.3, 1e-3, np.full(len(only), 9))
+    words = (1 - 1e-3) * model.confusion + np.float32(1e-3 / plausible.shape[1])
+    np.testing.assert_array_equal(model.likelihood, words @ plausible.T)
+    np.testing.assert_allclose(
+        model.expected_counts(counts), counts @ plausible * (1 - 1e-3) * model.confusion, rtol=1e-12
+    )
+    soft = LabelEvidence(evidence.classes, np.full((1, len(evidence.classes)), 1 / 8, np.float32))
+    blank = LabelEvidence(evidence.classes[:1], np.array([[1], [0]], np.float32))  # the second says nothing
+    assert soft.only_words is None and blank.only_words is None
 
 
 def test_of_very_many_regions_the_largest_stand_alone() -> None:

@@ -41,9 +41,7 @@ class ErrorModel:
         cls, evidence: LabelEvidence, counts: np.ndarray, prior: float, outliers: float, areas: np.ndarray  # (L,) px
     ) -> ErrorModel:  # fmt: skip
         """Estimate a model from counts of predicted classes under each label, (K, L) px."""
-        if evidence.word_plausibility is not None:
-            shares = evidence.word_plausibility[evidence.informative]
-            counts = counts[:, evidence.informative] @ (shares / shares.sum(axis=1, keepdims=True))
+        counts = _by_word(evidence, counts, divided=True)
         pseudo_counts = prior * counts[evidence.correct_words(len(counts))[0]].sum(axis=1)
         uniform = np.full(counts.shape, 1.0 / len(evidence.vocabulary), np.float32)
         model = cls(evidence, uniform, pseudo_counts, outliers, areas)
@@ -64,8 +62,8 @@ class ErrorModel:
     def likelihood(self) -> np.ndarray:
         """C_v: probability of each label given the class, (K, L) float32."""
         words: np.ndarray = (1 - self.outliers) * self.confusion + np.float32(self.outliers / self.confusion.shape[1])
-        plausible = self.evidence.word_plausibility
-        return words if plausible is None else np.asarray(words @ plausible.T)
+        only, plausible = self.evidence.only_words, self.evidence.word_plausibility
+        return words.T[only].T if plausible is None or only is not None else np.asarray(words @ plausible.T)
 
     @property
     def by_label(self) -> tuple[np.ndarray, np.ndarray]:
@@ -81,9 +79,7 @@ class ErrorModel:
 
         The counts are px of each class under each label, (K, L), divided by the label's likelihood.
         """
-        if self.evidence.word_plausibility is not None:
-            counts = counts[:, self.evidence.informative] @ self.evidence.word_plausibility[self.evidence.informative]
-        return counts * (1 - self.outliers) * self.confusion
+        return _by_word(self.evidence, counts) * (1 - self.outliers) * self.confusion
 
     def m_step(self, counts: np.ndarray) -> None:
         """Set the confusion matrix to its maximiser for expected counts, (K, W) px; rows without any count stay.
@@ -105,3 +101,18 @@ class ErrorModel:
         parts = words[:, former] * share[shown]
         np.subtract.at(words.T, former, parts.T)
         self.confusion[shown] = np.column_stack([words, parts])
+
+
+def _by_word(evidence: LabelEvidence, counts: np.ndarray, *, divided: bool = False) -> np.ndarray:  # (K, L)
+    """Sum counts under each label by the words that it can mean, (K, W): by their plausibility, or its shares."""
+    plausible, only = evidence.word_plausibility, evidence.only_words
+    if plausible is None:
+        return counts
+    if only is not None:  # A product of matrices would take as long as there are words, for nothing but zeros.
+        order, words = np.argsort(only, kind="stable"), np.zeros((plausible.shape[1], len(counts)))
+        first = np.flatnonzero(np.diff(only[order], prepend=-1))
+        words[only[order][first]] = np.add.reduceat(counts.T[order], first, axis=0)
+        return np.ascontiguousarray(words.T)
+    shares = plausible[evidence.informative]
+    shares = shares / shares.sum(axis=1, keepdims=True) if divided else shares
+    return counts[:, evidence.informative] @ shares

@@ -7,7 +7,7 @@ int64 in units of `GRADIENT_UNIT`, and a `prior`, (Z,) float32 in px. The `likel
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any, TypeVar
 
 import numba as nb
@@ -26,6 +26,7 @@ from gsseg_core.simd import intrinsic
 T = TypeVar("T")
 
 BLOCKS = 16  # counts are summed in this many parts, then together, so that they do not depend on the number of threads
+_AT_ONCE = 1 << 23  # numbers of such parts that there is memory for at a time; one part at least
 
 GRADIENT_UNIT = 2.0**-24
 """Gradients are sums of whole multiples of this, in px, so they depend neither on the order of views nor on where."""
@@ -187,17 +188,41 @@ def confusion_counts(
     codes: CSRRows, pairs: ViewPairs, shares: np.ndarray, num_classes: int, num_labels: int
 ) -> np.ndarray:
     """Sum over the pairs of codes[m] times share, by class and label, (K, L) float64; row m is of `pairs.ids[m]`."""
-    parts = np.zeros((BLOCKS, num_classes, num_labels))
-    _count_confusions(codes, pairs, shares, parts)
-    return np.asarray(parts.sum(axis=0))
+
+    def count(first: int, parts: np.ndarray) -> None:
+        _count_confusions(codes, pairs, shares, first, parts)
+
+    return _in_parts((num_classes, num_labels), count)
+
+
+def _in_parts(shape: tuple[int, int], count: Callable[[int, np.ndarray], None]) -> np.ndarray:
+    """Add up tables of all blocks: `count` takes the first block of some, and their tables as zeros, to be filled."""
+    total = np.zeros(shape)
+    parts = np.zeros((min(max(_AT_ONCE // max(total.size, 1), 1), BLOCKS), *shape))
+    for first in range(0, BLOCKS, len(parts)):
+        some = parts[: BLOCKS - first]
+        count(first, some)
+        _move_into(total, some)
+    return total
 
 
 @kernel(parallel=True)
-def _count_confusions(codes: CSRRows, pairs: ViewPairs, shares: np.ndarray, parts: np.ndarray) -> None:
+def _move_into(total: np.ndarray, parts: np.ndarray) -> None:
+    """Add tables to a total, one after the other, and leave zeros, which is most of what they are, in them."""
+    for k in nb.prange(total.shape[0]):
+        for place in range(parts.shape[0]):
+            for y in range(total.shape[1]):
+                if parts[place, k, y] != 0:
+                    total[k, y] += parts[place, k, y]
+                    parts[place, k, y] = 0
+
+
+@kernel(parallel=True)
+def _count_confusions(codes: CSRRows, pairs: ViewPairs, shares: np.ndarray, begin: int, parts: np.ndarray) -> None:
     indptr, classes, data = codes
     ids, start, labels = pairs
-    for block in nb.prange(BLOCKS):
-        part = parts[block]
+    for place in nb.prange(parts.shape[0]):
+        part, block = parts[place], begin + place
         for m in range(ids.shape[0] * block // BLOCKS, ids.shape[0] * (block + 1) // BLOCKS):
             for s in range(start[m], start[m + 1]):
                 for z in range(indptr[m], indptr[m + 1]):
@@ -218,9 +243,11 @@ def leave_one_out_counts(
     Gaussian counts at most `most` times the pixels that the other views saw of it.
     """
     pairs, own, class_ids = pairs_of(observation), observation.votes(), np.flatnonzero(possible)
-    parts = np.zeros((BLOCKS, len(possible), evidence.votes.indptr.shape[0] - 1))
-    _count(votes, pairs, own, evidence.votes, class_ids, power, most, parts)
-    return np.asarray(parts.sum(axis=0))
+
+    def count(first: int, parts: np.ndarray) -> None:
+        _count(votes, pairs, own, evidence.votes, class_ids, power, most, first, parts)
+
+    return _in_parts((len(possible), evidence.votes.num_rows), count)
 
 
 def subtract_votes(total: CSRRows, observation: Observation, label_votes: CSRRows) -> None:
@@ -269,18 +296,18 @@ def _raised(x: np.float32, power: float) -> np.float32:
 @kernel(parallel=True)
 def _count(
     votes: CSRRows, pairs: ViewPairs, own: np.ndarray, label_votes: CSRRows, class_ids: np.ndarray,
-    power: float, most: float, parts: np.ndarray,
+    power: float, most: float, begin: int, parts: np.ndarray,
 ) -> None:  # fmt: skip
     """Count as `leave_one_out_counts` does, row by row, so that the votes of the other views are never stored.
 
-    The counts are the sum of `parts`, (BLOCKS, K, L) float64, which come as zeros. The ids of classes are ascending;
-    other arrays are those of `_subtract_votes`.
+    The counts are the sum over all blocks; `parts`, (B, K, L) float64, are of those from `begin` on, and come as zeros.
+    The ids of classes are ascending; other arrays are those of `_subtract_votes`.
     """
     indptr, classes, data = votes
     ids, start, labels = pairs
     num_classes = parts.shape[1]
-    for block in nb.prange(BLOCKS):
-        part = parts[block]
+    for place in nb.prange(parts.shape[0]):
+        part, block = parts[place], begin + place
         which, remaining = np.empty(num_classes + 1, np.uint32), np.empty(num_classes + 1, np.int64)
         kept_which, kept_votes = np.empty_like(which), np.empty_like(remaining)
         codes = np.empty(num_classes + 1, np.float32)
