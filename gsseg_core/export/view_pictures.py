@@ -145,7 +145,7 @@ def draw_worst_views(
     device: str = "cpu",  # where images are made: on the CPU, two at once
 ) -> np.ndarray:
     """Draw the worst views: the mask, what other views predict, and in red where the two differ; (H, W, 3) uint8."""
-    colors = palette(len(checks[0].counts))
+    colors = palette(checks[0].counts.num_rows)
 
     def draw(check: ViewCheck) -> list[np.ndarray]:
         view = views[check.name]

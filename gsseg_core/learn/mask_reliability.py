@@ -16,6 +16,7 @@ from typing import Any
 
 import numpy as np
 
+from gsseg_core.csr_rows import CSRRows, starts
 from gsseg_core.data.class_names import class_name
 from gsseg_core.data.label_evidence import LabelEvidence
 from gsseg_core.data.label_images import UNKNOWN, PackedLabels
@@ -41,13 +42,14 @@ Cells = tuple[np.ndarray, np.ndarray, np.ndarray]
 class ViewCheck:
     """Comparison of a view's mask with what the other views predict.
 
-    In `counts` are the pixels with a label of which there is a prediction, by class predicted (row) and label (column).
+    In `counts` are the pixels with a label of which there is a prediction, by class predicted (row) and label (column);
+    of thousands of classes, few are taken for each other.
     """
 
     name: str
     num_pixels: int  # with a label
     classes: np.ndarray  # (L,) int32: labels in the mask, ascending; in a partial one, "none of these" (-1) at last
-    counts: np.ndarray  # (K, L) int64
+    counts: CSRRows  # K rows of int64, L columns; none of them 0
     predicted: PackedLabels | None = None  # (H, W): what the other views predict, for pictures
     evidence: LabelEvidence | None = None  # of a soft or partial mask; `classes` are its vocabulary
     rejected: float = 0.0  # `Learner.rejected_share`
@@ -57,12 +59,12 @@ class ViewCheck:
     @property
     def checked(self) -> int:
         """Pixels with a label of which there is a prediction."""
-        return int(self.counts.sum())
+        return int(self.counts.data.sum())
 
     @property
     def reliability(self) -> float:
         """Share of the checked pixels whose label is the one predicted, in [0, 1]; NaN where there is none."""
-        return float(self.counts[self._right].sum() / self.checked) if self.checked else math.nan
+        return float(self.counts.data[self._right].sum() / self.checked) if self.checked else math.nan
 
     def prediction(self) -> np.ndarray:
         """Unpack what the other views predict, (H, W) int32."""
@@ -89,21 +91,29 @@ class ViewCheck:
 
     def cells(self) -> Cells:
         """List the counts that are not 0, of labels that are classes."""
-        predicted, place = np.nonzero(self.counts)
-        labels = self.classes[place].astype(np.int64)
+        labels = self.classes[self.counts.indices].astype(np.int64)
         named = labels >= 0
-        return predicted[named], labels[named], self.counts[predicted[named], place[named]]
+        return self._predicted[named], labels[named], self.counts.data[named]
 
     def confusions(self, count: int = 3) -> list[tuple[int, int, float]]:
         """List what was most often taken for something else: class predicted, label seen, share of checked pixels."""
-        wrong = self.counts.copy()
-        wrong[self._right] = 0
-        return [(k, int(self.classes[y]), pixels / self.checked) for k, y, pixels in largest_cells(wrong, count)]
+        wrong = np.flatnonzero(~self._right)
+        largest = wrong[np.argsort(-self.counts.data[wrong], kind="stable")[:count]]
+        predicted, labels = self._predicted[largest].tolist(), self.classes[self.counts.indices[largest]].tolist()
+        return list(zip(predicted, labels, (self.counts.data[largest] / self.checked).tolist(), strict=True))
 
     @property
-    def _right(self) -> tuple[np.ndarray, np.ndarray]:
-        """Where in the counts class and label agree."""
-        return (self.evidence or LabelEvidence(self.classes)).correct_words(len(self.counts))
+    def _predicted(self) -> np.ndarray:
+        """Class predicted of each of the counts, (Z,) int64."""
+        return np.repeat(np.arange(self.counts.num_rows), np.diff(self.counts.indptr))
+
+    @property
+    def _right(self) -> np.ndarray:
+        """Which of the counts are of pixels whose label is the one predicted, (Z,) bool."""
+        own = np.full(self.counts.num_rows, UNKNOWN)
+        classes, words = (self.evidence or LabelEvidence(self.classes)).correct_words(len(own))
+        own[classes] = words
+        return np.asarray(own[self._predicted] == self.counts.indices)
 
 
 def sum_cells(cells: Sequence[Cells]) -> Cells:
@@ -111,13 +121,6 @@ def sum_cells(cells: Sequence[Cells]) -> Cells:
     predicted, labels, pixels = map(np.concatenate, zip(*cells, strict=True))
     pairs, place = np.unique(predicted << 32 | labels, return_inverse=True)
     return pairs >> 32, pairs & 0xFFFFFFFF, np.bincount(place, pixels).astype(np.int64)
-
-
-def largest_cells(counts: np.ndarray, count: int) -> list[tuple[int, int, int]]:
-    """List rows, columns and values of the largest counts in a table that are not 0, the largest first."""
-    largest = np.argsort(-counts, axis=None, kind="stable")[:count]
-    places = zip(*(index.tolist() for index in np.unravel_index(largest, counts.shape)), strict=True)
-    return [(row, column, int(counts[row, column])) for row, column in places if counts[row, column]]
 
 
 class MaskChecker:
@@ -270,8 +273,9 @@ def compare_mask(
     known = table[:, : len(columns) + 1 if evidence is not None and evidence.has_none_of_these else len(columns)]
     places = np.where(classes >= 0, column[classes], len(columns))
     occurs = np.flatnonzero(places >= 0)
-    counts = np.zeros((num_classes, len(classes)), np.int64)
-    counts[np.ix_(rows, occurs)] = table[1:, places[occurs]]
+    few, lengths = CSRRows.from_dense(table[1:, places[occurs]]), np.zeros(num_classes, np.int64)
+    lengths[rows] = np.diff(few.indptr)
+    counts = CSRRows(starts(lengths), occurs[few.indices].astype(np.uint32), few.data)
     at_border = [np.concatenate([one[0], one[-1], one[:, 0], one[:, -1]]) for one in (labels, predicted)]
     cut = np.unique(at_border[0][(at_border[0] == at_border[1]) & (at_border[0] >= 0)])
     return ViewCheck(view.name, int(known.sum()), classes, counts, PackedLabels(predicted), evidence, cut=cut)

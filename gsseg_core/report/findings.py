@@ -79,7 +79,7 @@ class MaskChecks:
         """Count the views that show each class, by what is predicted: (K,) int64."""
         views = np.zeros(num_classes, np.int64)
         for check in self.checks:
-            shown = check.counts.sum(axis=1)
+            shown = check.counts.sums()
             views += (shown > 0) & (shown >= SHOWN * check.checked)
         return views
 

@@ -127,9 +127,9 @@ def _best_views(checked: MaskChecks, images: ViewImages, num_classes: int) -> di
     checks = checked.checks
     pixels, cut = (np.zeros((len(checks), num_classes), kind) for kind in (np.int64, np.bool_))
     for place, check in enumerate(checks):
-        named = np.flatnonzero(check.classes >= 0)
-        known = check.classes[named]
-        pixels[place, known] = check.counts[known, named]
+        predicted, labels, count = check.cells()
+        right = predicted == labels
+        pixels[place, labels[right]] = count[right]
         cut[place, check.cut] = True
     at_hand = np.array([images.at_hand(checked.views[check.name]) for check in checks], bool)
     worth = np.minimum(pixels, ENOUGH) * np.where(cut, CUT, 1) * np.where(at_hand, 1, UNSEEN)[:, None]

@@ -84,7 +84,8 @@ def preview(run: PageInputs) -> Content:
     shown = make_preview(scene, segmentation, parts=bool(levels))
     # The more classes a view shows, the better it is to begin with.
     ranked = sorted(
-        run.checked.checks, key=lambda check: (-check.counts.any(axis=1).sum(), -np.nan_to_num(check.reliability))
+        run.checked.checks,
+        key=lambda check: (-np.count_nonzero(check.counts.sums()), -np.nan_to_num(check.reliability)),
     )
     cameras = [views[check.name].camera for check in ranked[:LOOKS]]
     poster = None

@@ -171,7 +171,8 @@ def test_views_that_are_worked_on_several_at_once_give_the_same_results(
     assert list(together.error_models_) == list(alone.error_models_) and together.history_ == alone.history_
     for one, other in zip(check_views(together), check_views(alone), strict=True):
         assert one.name == other.name
-        np.testing.assert_array_equal(one.counts, other.counts)
+        for counts in zip(one.counts, other.counts, strict=True):
+            np.testing.assert_array_equal(*counts)
 
 
 @every_learner

@@ -16,6 +16,7 @@ from gsseg_core.data.soft_masks import SeenLabels
 from gsseg_core.data.view import View
 from gsseg_core.errors import StateFileError
 from gsseg_core.learn.learner_state import State
+from gsseg_core.learn.merged_states import merge_states
 from gsseg_core.live import living_session
 from gsseg_core.live.living_session import LivingSession
 from gsseg_core.live.living_votes import LivingVotes, without_views
@@ -309,6 +310,13 @@ def test_while_views_are_taken_out_others_are_fused_and_the_scene_may_change(
         whole.fuse(view)
     assert session.num_fused == 6 and not meanwhile
     np.testing.assert_array_equal(session._live._votes.dense(), whole._live._votes.dense())
+
+
+def test_where_nothing_came_meanwhile_states_are_added_up_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    session, other = load(robot(tmp_path / "a.npz", VIEWS[:3])), robot(tmp_path / "b.npz", VIEWS[2:5])
+    sums = list[object]()
+    monkeypatch.setattr(living_session, "merge_states", lambda *given: sums.append(given) or merge_states(*given))
+    assert session.merge([other]) == 2 and session.num_fused == 5 and len(sums) == 1
 
 
 def test_views_of_groups_that_moved_since_are_counted_once(tmp_path: Path) -> None:

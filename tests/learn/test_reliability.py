@@ -13,6 +13,7 @@ from small_scenes import HEIGHT, NAMES, NUM_CLASSES, WIDTH, balls_on_a_table, cl
 from view_errors import corrupt_views
 from wrong_masks import WrongMasks
 
+from gsseg_core.csr_rows import CSRRows
 from gsseg_core.data.label_images import UNKNOWN
 from gsseg_core.data.view import View
 from gsseg_core.errors import MaskFormatError
@@ -61,13 +62,14 @@ def test_agreement_of_a_class_that_was_taken_for_another_is_low_and_of_the_backg
     for name in BAD:
         check = checks()[name]
         right = np.zeros(NUM_CLASSES)
-        right[check.classes] = check.counts[check.classes, np.arange(len(check.classes))]
-        agreement = right / check.counts.sum(axis=1)
+        counts = check.counts.dense(len(check.classes))
+        right[check.classes] = counts[check.classes, np.arange(len(check.classes))]
+        agreement = right / counts.sum(axis=1)
         assert agreement[0] > 0.95 and (agreement[1:] < 0.2).all()
 
 
 def test_confusions_name_what_was_taken_for_what_largest_first() -> None:
-    check = ViewCheck("a", 110, np.array([0, 2]), np.array([[50, 3], [10, 0], [7, 30]]))
+    check = ViewCheck("a", 110, np.array([0, 2]), CSRRows.from_dense(np.array([[50, 3], [10, 0], [7, 30]])))
     assert check.checked == 100 and check.reliability == pytest.approx(0.8)
     assert check.confusions(2) == [(1, 0, 0.1), (2, 0, 0.07)]
 
@@ -92,7 +94,7 @@ def test_a_view_is_held_against_the_others_only() -> None:
     alone = check_views(learner)[0]
     truth = CLEAN[0].read_labels()
     # Nobody else has seen what it shows, so only the empty rays, which belong to the background, say anything.
-    assert alone.checked < truth.size and not alone.counts[1:].any()
+    assert alone.checked < truth.size and not alone.counts.sums()[1:].any()
     assert (alone.prediction()[truth > 0] == UNKNOWN).mean() > 0.9
 
 
@@ -111,9 +113,17 @@ def test_a_mask_is_compared_by_the_classes_that_occur_however_many_names_there_a
     tracemalloc.stop()
     assert peak < 2**24, "of tables of all names, one row each would take 512 KiB"
     assert many.classes.tolist() == ids[few.classes].tolist() and many.num_pixels == few.num_pixels
-    np.testing.assert_array_equal(many.counts[ids], few.counts)
+    np.testing.assert_array_equal(many.counts.dense(4)[ids], few.counts.dense(4))
     assert many.checked == few.checked and many.reliability == few.reliability
     assert many.confusions() == [(ids[k], ids[y], share) for k, y, share in few.confusions()]
+
+
+def test_a_check_holds_what_occurs_however_many_labels_and_names_there_are() -> None:
+    labels = np.arange(HEIGHT * WIDTH, dtype=np.int32).reshape(HEIGHT, WIDTH)
+    check = compare_mask(View.from_arrays(CLEAN[0].camera, labels), labels // 2 * 2, 65_535)
+    assert sum(part.nbytes for part in check.counts) < 2**20, "all classes by all labels would take 1.6 GB"
+    assert check.checked == labels.size and check.reliability == 0.5
+    assert check.confusions(2) == [(0, 1, 1 / labels.size), (2, 3, 1 / labels.size)]
 
 
 def test_a_prediction_of_another_view_or_of_other_classes_is_refused() -> None:
@@ -152,8 +162,8 @@ def test_of_what_is_compared_in_a_large_view_of_any_size_some_is_sampled(size: t
 
 
 def test_views_of_which_nothing_is_known_come_last_and_have_no_figure() -> None:
-    unknown = ViewCheck("unknown", 5, np.array([1]), np.zeros((2, 1), np.int64))
-    good = ViewCheck("good", 5, np.array([1]), np.array([[0], [5]]))
+    unknown = ViewCheck("unknown", 5, np.array([1]), CSRRows.empty(2, np.int64))
+    good = ViewCheck("good", 5, np.array([1]), CSRRows.from_dense(np.array([[0], [5]])))
     assert math.isnan(unknown.reliability) and good.reliability == 1
     assert [check.name for check in worst_views([unknown, good])] == ["good", "unknown"]
     assert reliability_report([unknown], {})[0] == {
@@ -180,7 +190,9 @@ def test_a_check_tells_which_classes_the_border_cuts() -> None:
 
 def test_the_same_views_give_the_same_figures() -> None:
     again = check_views(learner_with_bad_frames())
-    assert all((check.counts == checks()[check.name].counts).all() for check in again)
+    for check in again:
+        for one, other in zip(check.counts, checks()[check.name].counts, strict=True):
+            np.testing.assert_array_equal(one, other)
 
 
 def test_picture_has_a_row_of_three_for_each_of_the_worst_views() -> None:

@@ -19,6 +19,7 @@ from small_scenes import (
 )
 
 from gsseg_core.cli.main import main
+from gsseg_core.csr_rows import CSRRows
 from gsseg_core.data.dataset import Dataset
 from gsseg_core.data.label_images import write_mask
 from gsseg_core.data.view import View
@@ -33,7 +34,7 @@ def check(classes: list[int], counts: dict[tuple[int, int], int]) -> ViewCheck:
     table = np.zeros((8, len(classes)), np.int64)
     for cell, count in counts.items():
         table[cell] = count
-    return ViewCheck("view", int(table.sum()), np.array(classes, np.int32), table)
+    return ViewCheck("view", int(table.sum()), np.array(classes, np.int32), CSRRows.from_dense(table))
 
 
 def found_in(views: list[View]) -> dict[int, int]:

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from report_cases import minimal_report
 
+from gsseg_core.csr_rows import CSRRows
 from gsseg_core.data.label_images import UNKNOWN
 from gsseg_core.learn.mask_reliability import ViewCheck, ranked_examples
 from gsseg_core.report.findings import Confusion, MaskChecks, warnings_of
@@ -15,7 +16,7 @@ from gsseg_core.report.findings import Confusion, MaskChecks, warnings_of
 
 def check(name: str, classes: list[int], counts: list[list[int]]) -> ViewCheck:
     pixels = np.array(counts, np.int64)
-    return ViewCheck(name, int(pixels.sum()), np.array(classes, np.int32), pixels)
+    return ViewCheck(name, int(pixels.sum()), np.array(classes, np.int32), CSRRows.from_dense(pixels))
 
 
 def written_out(confusion: Confusion) -> tuple[list[int], np.ndarray]:
@@ -42,7 +43,8 @@ def test_confusion_is_the_sum_over_views_and_ignores_what_is_no_class() -> None:
 def test_confusion_is_of_the_classes_that_occur_however_many_names_there_are() -> None:
     pixels = np.zeros((65_535, 2), np.int64)
     pixels[[7, 7, 60_000], [0, 1, 1]] = 5, 2, 9
-    confusion = MaskChecks([ViewCheck("one", 16, np.array([3, 60_000]), pixels)], {}, True).confusion()
+    one = ViewCheck("one", 16, np.array([3, 60_000]), CSRRows.from_dense(pixels))
+    confusion = MaskChecks([one], {}, True).confusion()
     classes, table = written_out(confusion)
     assert classes == [3, 7, 60_000]
     np.testing.assert_array_equal(table, [[0, 0, 0], [5, 0, 2], [0, 0, 9]])
