@@ -189,11 +189,12 @@ class LivingSession(LiveSession):
             still, known = copy(self), self._known()  # From here on the scene may change, and views come.
         saved = [still._read_saved(path, within) for path in paths]
         without = cache(lambda state, *what: without_views(state, *what, living=still.living, device=still.device))
-        merge_states([known, *saved], without)  # Views are taken out, which takes long, while none waits to be fused.
+        merged = merge_states([known, *saved], without)  # It takes long, and meanwhile views can be fused.
         with self._lock:
             if self._living is not still.living:
                 return self.merge(paths, within)  # Now that it cannot change again.
-            merged = merge_states([self._known(), *saved], without)
+            if self._version != still._version:
+                merged = merge_states([self._known(), *saved], without)
             self._live.adopt(merged)  # First: with too little memory for it, nothing has changed.
             self._classes.reset(merged.class_names)
             came, self.num_fused = merged.num_fused - self.num_fused, merged.num_fused
