@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import pickle
 from copy import deepcopy
 from typing import Any
 
@@ -294,6 +295,15 @@ def test_the_error_model_tells_which_object_was_swapped_in_which_view() -> None:
         seen_as = model.evidence.vocabulary[model.confusion[1].argmax()]
         assert seen_as == (3 if view is views[2] else 1)
         assert model.evidence.vocabulary[model.confusion[2].argmax()] == 2
+
+
+def test_error_models_hold_what_their_views_show_however_many_classes_there_are() -> None:
+    few, many = (taught(EMLearner(SCENE, count), clean_views(4)).fit() for count in (NUM_CLASSES, 20_000))
+    for name, model in many.error_models_.items():
+        assert len(pickle.dumps(model)) < 10_000, "a row of each class would take 400 kB"
+        np.testing.assert_array_equal(model.confusion[:NUM_CLASSES], few.error_models_[name].confusion)
+        assert model.confusion.shape[0] == 20_000 and np.ptp(model.confusion[NUM_CLASSES:]) == 0
+    np.testing.assert_array_equal(many.codes_[:, :NUM_CLASSES], few.codes_)
 
 
 def test_without_the_error_model_every_mask_is_taken_at_its_word() -> None:

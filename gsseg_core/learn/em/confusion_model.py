@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -16,12 +16,18 @@ A class with few pixels there is taken to divide as all classes together do.
 """
 
 
-@dataclass
+@dataclass(frozen=True, eq=False)
 class ErrorModel:
-    """Probability of each label of one view's mask given the true class."""
+    """Probability of each label of one view's mask given the true class.
+
+    Rows of the confusion matrix are kept of the classes that the view shows: of thousands, these are a few hundred.
+    """
 
     evidence: LabelEvidence  # of the L labels that occur in the view's mask, in a vocabulary of W words
-    confusion: np.ndarray  # (K, W) float32: R_v; rows, true classes, sum to 1; columns are `evidence.vocabulary`
+    num_classes: int  # K
+    shown: np.ndarray  # (R,) int64: classes whose rows are known
+    rows: np.ndarray  # (R, W) float32: these
+    other: float  # what all other rows hold
     pseudo_counts: np.ndarray  # (T,) float64: a_v, px added to the count of the correct word of each class that has one
     outliers: float  # share of pixels labelled by chance
     areas: np.ndarray  # (L,) px with each label
@@ -31,10 +37,10 @@ class ErrorModel:
         cls, evidence: LabelEvidence, num_classes: int, outliers: float, areas: np.ndarray  # (L,) px
     ) -> ErrorModel:  # fmt: skip
         """Make the model of a segmenter whose labels are all correct."""
-        confusion = np.zeros((num_classes, len(evidence.vocabulary)), np.float32)
-        correct = evidence.correct_words(num_classes)
-        confusion[correct] = 1.0
-        return cls(evidence, confusion, np.zeros(len(correct[0])), outliers, areas)
+        classes, words = evidence.correct_words(num_classes)
+        rows = np.zeros((len(classes), len(evidence.vocabulary)), np.float32)
+        rows[np.arange(len(classes)), words] = 1.0
+        return cls(evidence, num_classes, classes, rows, 0.0, np.zeros(len(classes)), outliers, areas)
 
     @classmethod
     def from_counts(
@@ -43,10 +49,16 @@ class ErrorModel:
         """Estimate a model from counts of predicted classes under each label, (K, L) px."""
         counts = _by_word(evidence, counts, divided=True)
         pseudo_counts = prior * counts[evidence.correct_words(len(counts))[0]].sum(axis=1)
-        uniform = np.full(counts.shape, 1.0 / len(evidence.vocabulary), np.float32)
-        model = cls(evidence, uniform, pseudo_counts, outliers, areas)
-        model.m_step(counts)
-        return model
+        num_classes, num_words = counts.shape
+        none = np.empty(0, np.int64), np.empty((0, num_words), np.float32)
+        return cls(evidence, num_classes, *none, 1.0 / num_words, pseudo_counts, outliers, areas).m_step(counts)
+
+    @property
+    def confusion(self) -> np.ndarray:
+        """R_v, (K, W) float32: rows, true classes, sum to 1; columns are `evidence.vocabulary`."""
+        confusion = np.full((self.num_classes, self.rows.shape[1]), self.other, np.float32)
+        confusion[self.shown] = self.rows
+        return confusion
 
     @property
     def num_pixels(self) -> int:
@@ -61,7 +73,7 @@ class ErrorModel:
     @property
     def likelihood(self) -> np.ndarray:
         """C_v: probability of each label given the class, (K, L) float32."""
-        words: np.ndarray = (1 - self.outliers) * self.confusion + np.float32(self.outliers / self.confusion.shape[1])
+        words: np.ndarray = (1 - self.outliers) * self.confusion + np.float32(self.outliers / self.rows.shape[1])
         only, plausible = self.evidence.only_words, self.evidence.word_plausibility
         return words.T[only].T if plausible is None or only is not None else np.asarray(words @ plausible.T)
 
@@ -81,8 +93,10 @@ class ErrorModel:
         """
         return _by_word(self.evidence, counts) * (1 - self.outliers) * self.confusion
 
-    def m_step(self, counts: np.ndarray) -> None:
-        """Set the confusion matrix to its maximiser for expected counts, (K, W) px; rows without any count stay.
+    def m_step(self, counts: np.ndarray) -> ErrorModel:
+        """Return it with the confusion matrix of most posterior density for expected counts, (K, W) px.
+
+        Rows without any count stay.
 
         A rejected region is a word of its own, and a part of the word that its pixels had before. C[k, word] is
         estimated of both together, then divided: C[k, part] = C[k, word] P(part | k, word), the latter with a prior of
@@ -100,7 +114,9 @@ class ErrorModel:
         words = named[shown] / total[shown]
         parts = words[:, former] * share[shown]
         np.subtract.at(words.T, former, parts.T)
-        self.confusion[shown] = np.column_stack([words, parts])
+        left = ~shown[self.shown]
+        rows = np.concatenate([np.column_stack([words, parts]).astype(np.float32), self.rows[left]])
+        return replace(self, shown=np.append(np.flatnonzero(shown), self.shown[left]), rows=rows)
 
 
 def _by_word(evidence: LabelEvidence, counts: np.ndarray, *, divided: bool = False) -> np.ndarray:  # (K, L)

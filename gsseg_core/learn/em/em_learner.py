@@ -24,7 +24,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from contextlib import nullcontext
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import partial
 from typing import Any
 
@@ -386,9 +386,7 @@ class EMLearner(Learner):
             counts[0] += shares.rest
             # Only some pixels of each label were gone through: they count for all of them.
             counts *= observation.areas / np.maximum(observation.weighted_areas, 1)
-            refitted = replace(model, confusion=model.confusion.copy())
-            refitted.m_step(model.expected_counts(counts))
-            return refitted
+            return model.m_step(model.expected_counts(counts))
 
         return None, dict(self._of_each(refit, models, tick))
 
