@@ -22,7 +22,7 @@ from functools import cached_property
 
 import numpy as np
 
-from gsseg_core.csr_rows import CSRRows
+from gsseg_core.csr_rows import CSRRows, starts
 from gsseg_core.data.label_images import UNKNOWN
 from gsseg_core.kernels.compiler import called_by_kernels
 
@@ -102,18 +102,25 @@ class LabelEvidence:
 
     @cached_property
     def only_words(self) -> np.ndarray | None:
-        """Position of the one word that each label can mean, (L,) int64; None where one of them can mean several."""
-        plausible = self.word_plausibility
-        if plausible is None:
+        """Position of the one word that each label means, (L,) int64; None for masks that are soft or partial."""
+        if self.mass is None:
             return np.arange(len(self.classes))
-        alone = (plausible.max(axis=1, initial=0) == 1) & (np.count_nonzero(plausible, axis=1) == 1)
-        return plausible.argmax(axis=1) if (alone & self.informative).all() else None
+        if not self.is_certain or (np.count_nonzero(self.mass, axis=1) > 1).any():
+            return None
+        words = self.mass.argmax(axis=1)
+        if self.nameless is not None:
+            words[self.nameless] = len(self.classes) + np.arange(np.count_nonzero(self.nameless))
+        return words
 
     @cached_property
     def votes(self) -> CSRRows:
         """Votes of a pixel of each label: the mass of a class, less the rest if it was looked for; float64."""
         if self.mass is None:
             return CSRRows(np.arange(len(self.classes) + 1), self.classes.astype(np.uint32), np.ones(len(self.classes)))
+        if self.only_words is not None:  # Tables of thousands of labels take long to look through.
+            named = self.only_words < len(self.classes)  # The others are nameless.
+            classes = self.classes[self.only_words[named]].astype(np.uint32)
+            return CSRRows(starts(named), classes, np.ones(len(classes)))
         votes = np.zeros((len(self.mass), len(self.concerned)))
         votes[:, np.searchsorted(self.concerned, self.classes)] = self.mass
         if self.supervised is not None:

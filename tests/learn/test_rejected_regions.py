@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import tracemalloc
+
 import numpy as np
 import pytest
 from hypothesis import given
@@ -68,6 +70,9 @@ def test_regions_of_one_word_each_need_no_product_of_matrices() -> None:
     only, plausible = evidence.only_words, evidence.word_plausibility
     assert only is not None and plausible is not None
     np.testing.assert_array_equal(np.eye(plausible.shape[1])[only], plausible)
+    assert evidence.nameless is not None and evidence.mass is not None
+    voted = np.where(evidence.nameless[:, None], 0, evidence.mass)
+    np.testing.assert_array_equal(evidence.votes.dense(6)[:, evidence.classes], voted)
     counts = rng.random((6, len(only)))
     model = ErrorModel.from_counts(evidence, counts, 0.3, 1e-3, np.full(len(only), 9))
     words = (1 - 1e-3) * model.confusion + np.float32(1e-3 / plausible.shape[1])
@@ -78,6 +83,16 @@ def test_regions_of_one_word_each_need_no_product_of_matrices() -> None:
     soft = LabelEvidence(evidence.classes, np.full((1, len(evidence.classes)), 1 / 8, np.float32))
     blank = LabelEvidence(evidence.classes[:1], np.array([[1], [0]], np.float32))  # the second says nothing
     assert soft.only_words is None and blank.only_words is None
+
+
+def test_votes_of_thousands_of_labels_take_memory_for_one_each() -> None:
+    evidence = LabelEvidence(np.arange(3_000, dtype=np.int32), np.eye(3_000, dtype=np.float32))
+    tracemalloc.start()
+    votes = evidence.votes
+    peak = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    assert peak < 2**25, "a table of all labels by all classes takes 72 MB"
+    assert votes.indices.tolist() == list(range(3_000)) and (votes.data == 1).all()
 
 
 def test_of_very_many_regions_the_largest_stand_alone() -> None:

@@ -74,8 +74,12 @@ class ErrorModel:
     def likelihood(self) -> np.ndarray:
         """C_v: probability of each label given the class, (K, L) float32."""
         words: np.ndarray = (1 - self.outliers) * self.confusion + np.float32(self.outliers / self.rows.shape[1])
-        only, plausible = self.evidence.only_words, self.evidence.word_plausibility
-        return words.T[only].T if plausible is None or only is not None else np.asarray(words @ plausible.T)
+        only = self.evidence.only_words
+        if only is not None:
+            return words.T[only].T
+        plausible = self.evidence.word_plausibility
+        assert plausible is not None, "labels of all masks but plain ones have some"
+        return np.asarray(words @ plausible.T)
 
     @property
     def by_label(self) -> tuple[np.ndarray, np.ndarray]:
@@ -121,14 +125,16 @@ class ErrorModel:
 
 def _by_word(evidence: LabelEvidence, counts: np.ndarray, *, divided: bool = False) -> np.ndarray:  # (K, L)
     """Sum counts under each label by the words that it can mean, (K, W): by their plausibility, or its shares."""
-    plausible, only = evidence.word_plausibility, evidence.only_words
-    if plausible is None:
+    only = evidence.only_words
+    if evidence.mass is None:
         return counts
     if only is not None:  # A product of matrices would take as long as there are words, for nothing but zeros.
-        order, words = np.argsort(only, kind="stable"), np.zeros((plausible.shape[1], len(counts)))
+        order, words = np.argsort(only, kind="stable"), np.zeros((len(evidence.vocabulary), len(counts)))
         first = np.flatnonzero(np.diff(only[order], prepend=-1))
         words[only[order][first]] = np.add.reduceat(counts.T[order], first, axis=0)
         return np.ascontiguousarray(words.T)
+    plausible = evidence.word_plausibility
+    assert plausible is not None, "labels of all masks but plain ones have some"
     shares = plausible[evidence.informative]
     shares = shares / shares.sum(axis=1, keepdims=True) if divided else shares
     return counts[:, evidence.informative] @ shares
