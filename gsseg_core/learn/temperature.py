@@ -117,11 +117,14 @@ def sample_grid(image: np.ndarray, labels: np.ndarray) -> Sample:
     known = np.flatnonzero(labelled & (total > 0.5))
     unknown = int(labelled.sum()) - len(known)
     known = known[np.argsort(seen[known], kind="stable")]
-    shares, seen = shares[known] / total[known, None], seen[known]
+    seen, some = seen[known], shares.max(axis=0, initial=0) > 0
+    some[seen] = True
+    columns = np.flatnonzero(some)  # Of thousands of classes a view shows some: the others are not copied.
+    shares = shares[known[:, None], columns] / total[known, None]
     occurs = shares.max(axis=0, initial=0) > 1e-6
-    occurs[seen] = True
-    columns = np.flatnonzero(occurs)
-    return Sample(np.ascontiguousarray(shares[:, columns]), np.searchsorted(columns, seen), unknown)
+    occurs[np.searchsorted(columns, seen)] = True
+    columns = columns[occurs]
+    return Sample(np.ascontiguousarray(shares[:, occurs]), np.searchsorted(columns, seen), unknown)
 
 
 def fit_temperature(samples: Sequence[Sample]) -> float:

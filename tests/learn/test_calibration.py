@@ -169,6 +169,20 @@ def test_pixels_are_sampled_evenly_and_not_too_many(shape: tuple[int, int]) -> N
     assert sample.unknown == 0
 
 
+def test_a_sample_is_of_the_classes_that_a_view_shows_however_many_there_are() -> None:
+    labels = np.arange(32 * 32).reshape(32, 32) % 7 + 3
+    image = np.zeros((32, 32, 20_000), np.float32)
+    np.put_along_axis(image, labels[..., None], 0.75, axis=2)
+    image[0, 0], image[1:, :, 19_999] = 0, 1e-7
+    tracemalloc.start()
+    sample = sample_grid(image, labels)
+    peak = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    assert peak < 2**21, "a copy of all takes 82 MB"
+    assert sample.unknown == 1 and sample.seen.tolist() == sorted(np.arange(1, 1024) % 7)
+    np.testing.assert_allclose(sample.shares, np.eye(7)[sample.seen], atol=1e-6)
+
+
 def test_labelled_pixels_of_which_little_is_predicted_are_left_out_and_counted() -> None:
     labels = np.array([[0, 1, 2, UNKNOWN, UNKNOWN]])
     image = np.eye(3, dtype=np.float32)[labels] * np.array([1, 0.4, 0.6, 1, 0.1], np.float32)[:, None]
