@@ -1,11 +1,12 @@
 """Masks as automatic generators make them, drawn in many ways: how far the level that views tell is from the best one.
 
-Usage: python benchmarks/part_draws.py [--data FOLDER] [--draws 27|9] [--out results_out/part_draws.md]
+Usage: python benchmarks/part_draws.py [--data FOLDER] [--draws 27|9] [--seed 0] [--scene NAME] [--out FILE]
 
 Every draw has ids of each view's own. An object is split along its colours into 1 to at most 2, 4 or 8 parts, in each
 view anew, background and walls into one more; 0, 15 or 30 % of the neighbouring pairs are merged, objects with objects
 or background with background; 0, 10 or 30 % of the masks are missing; edges are off by 1 or 2 px. Nine draws leave the
-share of missing masks at 10 %.
+share of missing masks at 10 %. `--scene replica_apartment` is the real apartment, whose ids, shared by objects that are
+far apart, are told apart as in bench_ids.py.
 
 Objects are found in the train views but every seventh, with the level that the views tell and with fixed ones. Votes
 under their numbers are rendered in the views that were left out, and matched one to one with the true objects, the
@@ -21,7 +22,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
-from bench_ids import Masks, labels_of, neighbours, object_ious, rng
+from bench_ids import Masks, instances, labels_of, neighbours, object_ious, rng
 from machine import DATA
 from results import markdown, points
 from scipy.cluster.vq import kmeans2
@@ -41,6 +42,8 @@ from gsseg_core.segmentation import Segmentation
 
 SCENES = {"shelf": 0, "kitchen_table": 0, "workbench": 2}
 """The last class that is not an object: what is behind them, and what they stand on."""
+
+APARTMENT = "replica_apartment"
 
 LEVELS = (0.1, 0.15, 0.2, 0.3, 0.4, 0.5)
 LEAST_PX = 120
@@ -119,11 +122,13 @@ def _with_merged(parts: np.ndarray, background: np.ndarray, random: np.random.Ge
 class Trial:
     """A scene with one draw of its masks, lifted once."""
 
-    def __init__(self, scene: GaussianScene, views: Sequence[View], tests: Sequence[View], last: int) -> None:
+    def __init__(
+        self, scene: GaussianScene, views: Sequence[View], tests: Sequence[View], true: Masks, last: int
+    ) -> None:  # fmt: skip
         self.scene, self.tests = scene, tests
-        self.truth: Masks = {
-            name: np.where(labels <= last, np.minimum(labels, 0), labels)
-            for name, labels in labels_of(list(tests)).items()
+        self.truth = {
+            view.name: np.where(true[view.name] <= last, np.minimum(true[view.name], 0), true[view.name])
+            for view in tests
         }
         self.num_objects = len(np.unique(np.concatenate([labels[labels > 0] for labels in self.truth.values()])))
         self.observations, self.lifted = dict[str, Observation](), dict[str, Lifted]()
@@ -155,22 +160,27 @@ def _photo(view: View) -> np.ndarray:
     return photo
 
 
-def trials(folder: Path, ways: Sequence[PartMasks | None]) -> Iterator[tuple[PartMasks | None, Trial]]:
+def trials(
+    folder: Path, ways: Sequence[PartMasks | None], seed: int
+) -> Iterator[tuple[PartMasks | None, Trial]]:  # fmt: skip
     """Draw the masks of a scene in several ways; None takes those that came with it."""
-    last, scene = SCENES[folder.name], GaussianScene.load(folder / "scene.ply")
-    train = Dataset(folder).views("train")
+    last, scene = SCENES.get(folder.name, 0), GaussianScene.load(folder / "scene.ply")
+    dataset = Dataset(folder)
+    train = dataset.views("train")
+    true = instances(scene, dataset.views()) if folder.name == APARTMENT else labels_of(train)
     given = {view.name: view for view in Dataset(folder, "labels_parts").views("train")}
     kept = [view for k, view in enumerate(train) if k % 7 != 3]
     tests = [view for k, view in enumerate(train) if k % 7 == 3]
+    more = f" {seed}" if seed else ""
     for way in ways:
         views = []
         for view in kept:
             labels = (
                 replace(given[view.name], class_names=None).read_labels() if way is None
-                else drawn(view.read_labels(), _photo(view), last, rng(f"{folder.name} {view.name} {way}"), way)
+                else drawn(true[view.name], _photo(view), last, rng(f"{folder.name} {view.name} {way}{more}"), way)
             )  # fmt: skip
             views.append(View.from_arrays(view.camera, labels))
-        yield way, Trial(scene, views, tests, last)
+        yield way, Trial(scene, views, tests, true, last)
 
 
 def main() -> int:
@@ -179,14 +189,17 @@ def main() -> int:
     repository = Path(__file__).resolve().parents[1]
     parser.add_argument("--data", default=DATA, type=Path)
     parser.add_argument("--draws", choices=(9, 27), default=9, type=int)
+    parser.add_argument("--seed", default=0, type=int, help="of the draws; masks as given are left out but for 0")
+    parser.add_argument("--scene", choices=(*SCENES, APARTMENT))
     parser.add_argument("--out", default=repository / "results_out/part_draws.md", type=Path)
     options = parser.parse_args()
     ways, lines, behind = draws(options.draws), [], []
-    for folder in (options.data / name for name in SCENES):
-        if not (folder / "labels_parts").is_dir():
+    for folder in (options.data / name for name in ([options.scene] if options.scene else SCENES)):
+        if not folder.is_dir():
             print(f"{folder}: not there; set GSSEG_DATA or --data to the folder that holds it")
             continue
-        for way, trial in trials(folder, [None, *ways]):
+        given = [None] if options.seed == 0 and (folder / "labels_parts").is_dir() else []
+        for way, trial in trials(folder, [*given, *ways], options.seed):
             told, found, level = trial.score(AssociationSettings())
             fixed = [trial.score(AssociationSettings(agreement=each))[0] for each in LEVELS]
             behind.append(max(fixed) - told)

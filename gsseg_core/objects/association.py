@@ -16,7 +16,9 @@ all are, and they hardly ever make a vote together.
    taken: the share in which one id shows both whole, and the share of that among those in which each is shown whole.
    Their geometric mean is the agreement of C and D. Parts of one object are shown whole together as often as the object
    is; two objects only where both happen to be whole and have been merged as well. A view in which half of C is merged
-   with D, as where many neighbours are, does not count.
+   with D, as where many neighbours are, does not count. What has merged by mistake is hardly shown whole by any view,
+   and what the last few say must not join more to it: so a view that disagrees is added to each pair, or less where
+   there are few in all.
 2. **Clusters merge**, the most agreed pairs first; what has merged is compared anew, with the evidence of all its
    segments together. Down to an agreement of 0.6 that is so whatever the segmenter does. Where then hardly any clusters
    that touch agree by 0.3 to 0.6, no object comes in parts, and merging goes on to one half only: small ones must not
@@ -38,7 +40,7 @@ Nothing depends on the order of views or ids, nor on how many there are.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import numpy as np
@@ -60,6 +62,7 @@ _MANY = 0.2  # such share beyond which any two are the likelier one object, the 
 _USUAL, _BORDER = 0.75, 100.0  # strength of depth edges between any two, taken for so many px more of their border
 _SURFACE, _FACTORS = 4.0, (0.75, 1.8)  # by how much agreement grows as edges get weaker, and between what
 _OFTEN = 5  # views in which clusters touch, or that see one, from which on they tell how the segmenter works
+_MANY_VIEWS, _LEAST_DOUBT = 60, 0.3  # views from which on doubt counts in full; its share where they are few
 
 
 @dataclass(frozen=True)
@@ -68,7 +71,7 @@ class AssociationSettings:
 
     kept: float = 0.8  # share of a segment's weight that is kept, in its heaviest Gaussians, in (0, 1]
     agreement: float | None = None  # clusters merge above it, in (0, 1); by default, what the views tell
-    doubt: float = 0.3  # views that disagree, added to every pair: pairs that many views confirm merge first
+    doubt: float = 1.0  # views that disagree, added to every pair; of fewer than `_MANY_VIEWS`, as many fewer
     evidence: float = 0.3  # views, in full sight of both clusters, that it takes at least to merge two
     full_sight: float = 0.5  # share of a cluster, as far as any view sees it, that a view must see to count in full
     plenty: float = 2000.0  # px of a cluster that a view must see to count in full, however large the cluster is
@@ -122,6 +125,7 @@ def associate(views: Mapping[str, Lifted], settings: AssociationSettings | None 
     if not names:
         return Association({}, settings.agreement or _WHOLE)
     stack = Stack([views[name] for name in names])
+    settings = replace(settings, doubt=settings.doubt * np.clip(len(names) / _MANY_VIEWS, _LEAST_DOUBT, 1))
     clusters, agreement = _merge(stack, settings)
     objects = _by_size(_move(stack, clusters, settings), stack)
     return Association(dict(zip(names, np.split(objects, stack.starts[1:-1]), strict=True)), agreement)

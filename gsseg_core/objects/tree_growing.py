@@ -21,7 +21,7 @@ Nothing depends on the order of views or ids.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 
 import numpy as np
@@ -37,6 +37,7 @@ SEVERAL = 3  # views that have to show a part or a whole
 _CELL, _MOST_CELLS = 8, 256  # Gaussians of a cell; cells of an object, of which a larger one has larger cells
 _ITSELF = 0.5  # IoU above which a segment is a region: it can be so of no other one beside it
 _STEPS = 10  # agreements are told apart by a tenth
+_DOUBT = 0.3  # in place of that of the settings: where views are few, too, agreement is the share of them
 
 
 @dataclass(eq=False)
@@ -63,10 +64,11 @@ def grow_tree(
     num_classes: int,  # largest object that there may be, and one more for the background
     views: Mapping[str, Lifted],  # in any order; the names only break ties
     level: float,  # agreement down to which segments were put together, the granularity of the objects
-    settings: AssociationSettings | None = None,  # what of a view counts how much
+    settings: AssociationSettings | None = None,  # what of a view counts how much; `doubt` is the tree's own
 ) -> ObjectTree:
     """Find the parts of objects, and the wholes that they make."""
-    segments = _Segments.of(views, len(means), settings or AssociationSettings())
+    settings = replace(settings or AssociationSettings(), doubt=_DOUBT)
+    segments = _Segments.of(views, len(means), settings)
     objects = [_Region(row=k) for k in range(num_classes)]
     places = np.where(classes >= 0, 0, -1)  # among the leaves of its object
     of_class, nobody = rows_by_label(classes), np.zeros(0, np.int64)
