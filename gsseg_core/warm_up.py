@@ -183,6 +183,7 @@ def refine_something(device: str = "cpu") -> None:
     in_curve_order(scene)
     # What only some inputs need: soft masks, partial ones, and colours that are not of a PLY.
     quantise(np.stack([labels == 0, labels == 1]).astype(np.float32))
+    CSRRows.from_dense(np.eye(2))  # as for their votes
     rows = CSRRows.from_dense(codes)
     rows.united(rows.in_columns(rows.indices))  # as for parts of objects
     votes, own = CSRRows.from_dense(np.array([[-1, 1]])), np.zeros(1, np.int64)

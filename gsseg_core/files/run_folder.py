@@ -58,10 +58,11 @@ def staged_run(
     something cannot be written; what was there before is then unchanged, unless the message says otherwise.
     """
     run = StagedRun(Path(out), kind)
+    there = [folder for folder in inputs if os.path.exists(folder)]  # before the run makes one
     try:
         run.begin()
         run.claim(places)
-        run.keep_apart(inputs)
+        run.keep_apart(there)
         try:
             yield run
         except GssegError as error:  # Nobody knows the folder in which it was staged.
@@ -121,8 +122,8 @@ class StagedRun:
             _check_free(self.out, place, manifest, self._kind)
 
     def keep_apart(self, inputs: Iterable[str | os.PathLike[str]]) -> None:
-        """Raise `PathTakenError` if a folder that the run reads from is the one that it writes to."""
-        if any(os.path.exists(folder) and os.path.samefile(self.out, folder) for folder in inputs):
+        """Raise `PathTakenError` if one of the folders that the run reads from is the one that it writes to."""
+        if any(os.path.samefile(self.out, folder) for folder in inputs):
             raise PathTakenError(
                 f"{self.out}: gsseg {self._kind} reads from this folder; expected one for results alone"
             )
