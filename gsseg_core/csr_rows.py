@@ -56,6 +56,11 @@ class CSRRows(NamedTuple):
         """N."""
         return len(self.indptr) - 1
 
+    @property
+    def rows(self) -> np.ndarray:
+        """Row of each entry, (Z,) int64."""
+        return np.repeat(np.arange(self.num_rows), np.diff(self.indptr))
+
     def with_data(self, data: np.ndarray) -> CSRRows:
         """Replace the entries and keep where they stand."""
         return self._replace(data=data)

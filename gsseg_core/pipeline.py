@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 from gsseg_core.align.placing import Placed, place
 from gsseg_core.csr_rows import CSRRows
-from gsseg_core.data.dataset import Dataset
+from gsseg_core.data.dataset import Dataset, folders_of
 from gsseg_core.data.hints import FRAME_HINT, mask_hint
 from gsseg_core.data.label_images import GLOBAL, PER_VIEW, write_mask
 from gsseg_core.data.view import QUALITIES, spread
@@ -124,8 +124,7 @@ def segment(
     )  # fmt: skip
     watch = Stopwatch()
     settings.check()
-    folders = data, Path(data, labels), Path(data, "images")
-    with staged_run(out, "segment", places=settings.places({}, []), inputs=folders) as run:
+    with staged_run(out, "segment", places=settings.places({}, []), inputs=folders_of(data, labels)) as run:
         with ExitStack() as workers:
             with watch.stage("load"):
                 client = _connect(scheduler, workers)
@@ -308,8 +307,7 @@ def render(
     overview = ("contact_sheet.png", "legend.png")
     pictures = {name: f"overlays/{'overlay_' * (name in overview)}{name}" for name in names}
     places = [*names, *pictures.values(), *(f"overlays/{k}" for k in overview)]
-    folders = data, Path(data, "labels"), Path(data, "images")
-    with staged_run(out, "render", places=places, inputs=folders) as run:
+    with staged_run(out, "render", places=places, inputs=folders_of(data)) as run:
         drawn, save = draw_views(scene, numbered, views, device=device), partial(save_png, run=run.id)
         for name, (_, labels, image, _) in zip(with_progress(progress, "render", names), drawn, strict=True):
             write_mask(run.folder / name, ids[labels], bits, run.id)

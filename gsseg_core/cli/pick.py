@@ -53,7 +53,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(options: argparse.Namespace) -> int:
     """Pick, and say what was written."""
-    from gsseg_core.data.dataset import Dataset
+    from gsseg_core.data.dataset import Dataset, folders_of
     from gsseg_core.data.view import spread
     from gsseg_core.export.collision import check_collision
     from gsseg_core.export.pictures import save_png
@@ -71,8 +71,7 @@ def run(options: argparse.Namespace) -> int:
     posed = placed(options, scene, dataset, align=options.align).dataset
     cameras = {camera.name: camera for camera in posed.cameras}
     places = file, "object.obj", "pick.npz", "pick.png", "next.png"
-    inputs = dataset.root, dataset.root / "labels", dataset.root / "images"
-    with staged_run(out, "pick", places=places, inputs=inputs) as run:
+    with staged_run(out, "pick", places=places, inputs=folders_of(dataset.root)) as run:
         picked = _picked(options, scene, cameras, dataset)
         _write(options, scene, picked, cameras[options.views[0]], run.folder / file, run.id)
         unseen = spread([camera for name, camera in cameras.items() if name not in options.views], CANDIDATES)

@@ -27,6 +27,11 @@ from gsseg_core.scene.camera import Camera
 from gsseg_core.text import clipped, quoted
 
 
+def folders_of(root: str | os.PathLike[str], labels: str | os.PathLike[str] = "labels") -> tuple[Path, Path, Path]:
+    """Return the folder of a dataset, where its masks are, and the folder of its photos."""
+    return Path(root), Path(root, labels), Path(root, "images")
+
+
 class Dataset:
     """A dataset folder: cameras, and masks in `labels/`, `<stem>.png` or others of docs/masks.md.
 

@@ -232,8 +232,7 @@ def _read_votes(file: NpzArrays, shape: tuple[int, int], num_kept: int, num_fuse
     may_oppose = num_fused > num_kept or any(name.startswith("supervised_") for name in file.names)
     if not may_oppose and given.data.min(initial=0) < 0:
         raise UnfitError(f"array votes holds {given.data.min()}; expected none below 0")
-    rows = np.repeat(np.arange(shape[0]), np.diff(given.indptr))
-    most = np.bincount(rows, np.abs(given.data, dtype=np.float64)).max(initial=0)
+    most = np.bincount(given.rows, np.abs(given.data, dtype=np.float64)).max(initial=0)
     possible = min(num_fused * _VIEW_VOTES * (shape[1] if may_oppose else 1), _MOST_VOTES)
     if most > possible:
         raise UnfitError(

@@ -93,19 +93,14 @@ class ViewCheck:
         """List the counts that are not 0, of labels that are classes."""
         labels = self.classes[self.counts.indices].astype(np.int64)
         named = labels >= 0
-        return self._predicted[named], labels[named], self.counts.data[named]
+        return self.counts.rows[named], labels[named], self.counts.data[named]
 
     def confusions(self, count: int = 3) -> list[tuple[int, int, float]]:
         """List what was most often taken for something else: class predicted, label seen, share of checked pixels."""
         wrong = np.flatnonzero(~self._right)
         largest = wrong[np.argsort(-self.counts.data[wrong], kind="stable")[:count]]
-        predicted, labels = self._predicted[largest].tolist(), self.classes[self.counts.indices[largest]].tolist()
+        predicted, labels = self.counts.rows[largest].tolist(), self.classes[self.counts.indices[largest]].tolist()
         return list(zip(predicted, labels, (self.counts.data[largest] / self.checked).tolist(), strict=True))
-
-    @property
-    def _predicted(self) -> np.ndarray:
-        """Class predicted of each of the counts, (Z,) int64."""
-        return np.repeat(np.arange(self.counts.num_rows), np.diff(self.counts.indptr))
 
     @property
     def _right(self) -> np.ndarray:
@@ -113,7 +108,7 @@ class ViewCheck:
         own = np.full(self.counts.num_rows, UNKNOWN)
         classes, words = (self.evidence or LabelEvidence(self.classes)).correct_words(len(own))
         own[classes] = words
-        return np.asarray(own[self._predicted] == self.counts.indices)
+        return np.asarray(own[self.counts.rows] == self.counts.indices)
 
 
 def sum_cells(cells: Sequence[Cells]) -> Cells:

@@ -37,9 +37,9 @@ def renamed_ids(checks: Sequence[ViewCheck], others: Iterable[np.ndarray] = ()) 
 
 def renamed_among_samples(checker: MaskChecker) -> dict[int, int]:
     """Find `renamed_ids` by the masks that were sampled for calibration; others are read only if some seem to be."""
-    checks, views = checker.sampled_checks, checker.learner.views
-    others = (view.read_seen().named() for name, view in views.items() if name not in checks)
-    return renamed_ids(list(checks.values()), others) if renamed_ids(list(checks.values())) else {}
+    checks, sampled = list(checker.sampled_checks.values()), checker.sampled_checks
+    others = (view.read_seen().named() for name, view in checker.learner.views.items() if name not in sampled)
+    return renamed_ids(checks, others) if renamed_ids(checks) else {}
 
 
 def renamed_report(renamed: Mapping[int, int], class_names: Mapping[int, str]) -> list[dict[str, str]]:

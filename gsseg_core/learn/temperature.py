@@ -183,10 +183,9 @@ class _Cells(NamedTuple):
     def of(cls, sample: Sample) -> _Cells:
         shares, num_classes = CSRRows.from_dense(sample.shares), sample.shares.shape[1]
         present, label = np.unique(sample.seen, return_inverse=True)
-        pixel = np.repeat(np.arange(shares.num_rows), np.diff(shares.indptr))
-        met = shares.indices.astype(np.int64) * len(present) + label[pixel]
+        met = shares.indices.astype(np.int64) * len(present) + label[shares.rows]
         cells, place = np.unique(np.append(met, present * len(present) + np.arange(len(present))), return_inverse=True)
-        return cls(shares, pixel, place[: len(met)], cells // len(present), place[len(met) :], num_classes)
+        return cls(shares, shares.rows, place[: len(met)], cells // len(present), place[len(met) :], num_classes)
 
 
 def _log_likelihood(cells: _Cells, temperature: float) -> float:

@@ -71,8 +71,7 @@ def impute_probabilities(
 def _candidates(votes: CSRRows, possible: np.ndarray) -> np.ndarray:  # U rows of int64, (K,) bool
     """Mark the possible classes that Gaussians have no votes against, (U, K) bool."""
     candidates, against = np.tile(possible, (votes.num_rows, 1)), votes.data < 0
-    owners = np.repeat(np.arange(votes.num_rows), np.diff(votes.indptr))
-    candidates[owners[against], votes.indices[against]] = False
+    candidates[votes.rows[against], votes.indices[against]] = False
     return candidates
 
 

@@ -76,8 +76,10 @@ class Outcome:
     rejected: dict[str, str]
 
 
-def observe_and_fit(name: str, learner: Learner, views: Sequence[View], report: Report, watch: Stopwatch) -> Outcome:
-    """Have a learner observe views, fit and be calibrated."""
+def observe_and_fit(
+    name: str, learner: Learner, views: Sequence[View], report: Report, watch: Stopwatch, *, named: bool
+) -> Outcome:  # fmt: skip
+    """Have a learner observe views, fit and be calibrated; and if ids were `named` by a segmenter, compare these."""
 
     def progress(stage: str, done: int, total: int) -> None:
         report(stage, done, total, learner.loss)
@@ -89,6 +91,6 @@ def observe_and_fit(name: str, learner: Learner, views: Sequence[View], report: 
     with watch.stage("calibrate"):
         checker = MaskChecker(learner)
         temperature = calibrate(learner, checker, progress).temperature
-        renamed = renamed_among_samples(checker) if learner.checks_masks else {}
+        renamed = renamed_among_samples(checker) if named and learner.checks_masks else {}
     learnt = Learnt(name, learner.code_rows_, len(learner.views), temperature, learner.evidence(), renamed)
     return Outcome(learnt, len(learner.history_), learner.converged_, learner.loss, dict(learner.rejected))

@@ -19,7 +19,6 @@ from gsseg_core.data.view import View, spread
 from gsseg_core.errors import GssegError, NoCodesError, NoUsableViewsError, SettingsError, StateFileError
 from gsseg_core.learn.learner_state import OBJECTS_OF_ONE_SESSION, Learnt, State
 from gsseg_core.learn.registry import make_learner
-from gsseg_core.learn.renamed_ids import renamed_report
 from gsseg_core.learn.vote_learner import VoteLearner
 from gsseg_core.live.current_codes import current_codes, current_evidence
 from gsseg_core.live.living_votes import without_groups
@@ -114,12 +113,6 @@ class LiveSession:
     def learnt(self) -> Learnt | None:
         """Class probabilities of the last `learn`."""
         return self._learnt
-
-    @property
-    def renamed(self) -> list[dict[str, str]]:
-        """Ids that name one object, as far as the last `learn` with `em` could tell, as `report.json` lists them."""
-        learnt = self._learnt
-        return [] if learnt is None or self._PER_VIEW else renamed_report(learnt.renamed, self.class_names)
 
     @property
     def has_codes(self) -> bool:
@@ -224,7 +217,7 @@ class LiveSession:
             num_classes = self._classes.count_with(dataset, num_classes, self._live)
         made = make_learner(learner, scene, num_classes, max_steps=max_steps, device=self.device)
         views = spread(views, num_views)
-        outcome = observe_and_fit(learner, made, views, report, watch or Stopwatch())
+        outcome = observe_and_fit(learner, made, views, report, watch or Stopwatch(), named=not self._PER_VIEW)
         with self._lock:
             if era is not self._era:
                 raise NoUsableViewsError("all views were forgotten while they were learnt from; nothing was learnt")

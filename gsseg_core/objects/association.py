@@ -71,7 +71,7 @@ class AssociationSettings:
 
     kept: float = 0.8  # share of a segment's weight that is kept, in its heaviest Gaussians, in (0, 1]
     agreement: float | None = None  # clusters merge above it, in (0, 1); by default, what the views tell
-    doubt: float = 1.0  # views that disagree, added to every pair; of fewer than `_MANY_VIEWS`, as many fewer
+    doubt: float = 1.0  # views that disagree, added to every pair; with fewer than 60 views in proportion, 0.3 at least
     evidence: float = 0.3  # views, in full sight of both clusters, that it takes at least to merge two
     full_sight: float = 0.5  # share of a cluster, as far as any view sees it, that a view must see to count in full
     plenty: float = 2000.0  # px of a cluster that a view must see to count in full, however large the cluster is

@@ -7,7 +7,7 @@ from collections import Counter
 
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 
-from gsseg_core.learn.renamed_ids import renamed_note
+from gsseg_core.learn.renamed_ids import renamed_note, renamed_report
 from gsseg_core.live.results import SCENE_CHANGED
 from gsseg_core.live.session import LiveSession
 from gsseg_core.text import counted
@@ -79,7 +79,9 @@ def namesakes(inputs: Inputs) -> str:
 
 def renamed_ids_of(session: LiveSession) -> str:
     """Say which ids name one object, as far as what was learnt tells, and what to do; empty if none does."""
-    return renamed_note(session.renamed, "The parameter ids set to per-view", "label_map")
+    learnt = session.learnt  # Once: it may be forgotten meanwhile.
+    pairs = [] if learnt is None else renamed_report(learnt.renamed, session.class_names)
+    return renamed_note(pairs, "The parameter ids set to per-view", "label_map")
 
 
 def why_dropped(inputs: Inputs, reason: str) -> str:

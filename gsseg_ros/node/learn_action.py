@@ -91,7 +91,7 @@ class LearnAction:
         elif request.labels or request.label_map:
             raise InvalidRequestError("labels and label_map are those of a dataset; expected dataset_path beside them")
         self._workspace.placement.finish(job.check)  # What is learnt of views stays as it is where they move.
-        version, known = session.version, session.renamed
+        version, known = session.version, renamed_ids_of(session)
         try:
             outcome = session.learn(
                 learner,

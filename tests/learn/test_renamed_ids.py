@@ -25,7 +25,7 @@ from gsseg_core.data.label_images import write_mask
 from gsseg_core.data.view import View
 from gsseg_core.learn.em.em_learner import EMLearner
 from gsseg_core.learn.mask_reliability import ViewCheck, check_views
-from gsseg_core.learn.renamed_ids import renamed_ids
+from gsseg_core.learn.renamed_ids import renamed_ids, renamed_report
 from gsseg_core.live.session import LiveSession
 
 
@@ -35,6 +35,10 @@ def check(classes: list[int], counts: dict[tuple[int, int], int]) -> ViewCheck:
     for cell, count in counts.items():
         table[cell] = count
     return ViewCheck("view", int(table.sum()), np.array(classes, np.int32), CSRRows.from_dense(table))
+
+
+def renamed_in(session: LiveSession) -> list[dict[str, str]]:
+    return [] if session.learnt is None else renamed_report(session.learnt.renamed, session.class_names)
 
 
 def found_in(views: list[View]) -> dict[int, int]:
@@ -62,11 +66,11 @@ def test_what_one_mask_shows_together_is_two_objects() -> None:
 def test_a_session_finds_them_by_the_masks_that_it_samples_and_asks_all_masks_what_they_show_together() -> None:
     views = lost_half_way(clean_views(40))
     session = fed(LiveSession(balls_on_a_table()[0]), views)
-    assert session.renamed == []
+    assert renamed_in(session) == []
     session.learn("votes")
-    assert session.renamed == []
+    assert renamed_in(session) == []
     session.learn("em")
-    pairs = [{int(name[-2:]) for name in entry.values()} for entry in session.renamed]
+    pairs = [{int(name[-2:]) for name in entry.values()} for entry in renamed_in(session)]
     assert len(pairs) >= 2 and all(pair in [{k, k + NUM_CLASSES} for k in range(1, NUM_CLASSES)] for pair in pairs)
     checks = [check([1], {(2, 0): 9}), check([1], {(2, 0): 9}), check([2], {(2, 0): 1})]
     assert renamed_ids(checks, [np.array([[-1, 1, 7]])]) == {1: 2}
