@@ -82,12 +82,16 @@ def dense(operator):
 
 
 def lifting(operator, scene):
-    """W by which masks are lifted, (P, N), and what its rays have left over, (P,): they end as `T_LIFTED` says."""
+    """W by which masks are lifted, (P, N), and what its rays have left over, (P,): they end as `T_LIFTED` says.
+
+    What is left of a ray is rounded after each Gaussian, as lifting does: where it meets the limit, a bit decides.
+    """
     depths = scene.means @ operator.camera.world_to_camera[2, :3]
     order = np.argsort(depths, kind="stable")
     weights = dense(operator)[:, order]
-    after = 1 - np.cumsum(weights, axis=1)
-    before = np.column_stack([np.ones(len(after)), after[:, :-1]])
+    steps = np.column_stack([np.ones(len(weights)), weights]).astype(np.float32)
+    left = np.subtract.accumulate(steps, axis=1).astype(float)
+    before, after = left[:, :-1], left[:, 1:]
     ends = after < T_LIFTED
     full = np.zeros_like(weights)
     full[:, order] = np.where(before < T_LIFTED, 0, np.where(ends, before, weights))
