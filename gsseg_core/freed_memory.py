@@ -7,7 +7,9 @@ serves only the threads of that arena, while a node answers each request in anot
 A library leaves these choices to the program that it is in.
 
 At its end Python looks through all objects for those that refer to each other in circles, a quarter of a second of
-processor time after all that a program imports; the system has the memory of both kinds back a moment later.
+processor time after all that a program imports; the system has the memory of both kinds back a moment later. A program
+whose objects have threads of their own, as ROS nodes have, needs that search, or they run on while Python ends; it
+leaves out what was imported.
 """
 
 from __future__ import annotations
@@ -38,3 +40,8 @@ def keep_freed_memory() -> bool:
 def end_without_a_search() -> None:
     """Have this process end without a search for circles of objects, whose finalizers do not run then."""
     atexit.register(gc.freeze)
+
+
+def search_no_imports_at_the_end() -> None:
+    """Have searches for circles of objects, the one at the end among them, leave out all objects that there are now."""
+    gc.freeze()

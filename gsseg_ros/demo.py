@@ -27,7 +27,7 @@ from gsseg_core.errors import GssegError
 from gsseg_core.export.pictures import contact_sheet, palette, save_png
 from gsseg_core.export.view_pictures import write_overview
 from gsseg_core.files.run_folder import StagedRun, staged_run
-from gsseg_core.freed_memory import end_without_a_search
+from gsseg_core.freed_memory import search_no_imports_at_the_end
 from gsseg_core.learn.learner import Progress, silent
 from gsseg_core.metrics import evaluate_folders
 from gsseg_core.progress import Stopwatch, progress_bars
@@ -178,7 +178,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     if not 0 < options.rate <= 1000:
         parser.error(f"--rate is {options.rate:g}; expected more than 0 and at most 1000 masks per second")
 
-    end_without_a_search()
+    search_no_imports_at_the_end()
     out = Path(options.out)
     for number in (signal.SIGTERM, signal.SIGHUP):
         signal.signal(number, lambda number, _: sys.exit(128 + number))  # As Ctrl-C, through all that cleans up.

@@ -20,7 +20,7 @@ from rclpy.lifecycle import LifecycleNode, LifecycleState, TransitionCallbackRet
 from rclpy.parameter import Parameter
 from rclpy.signals import SignalHandlerOptions
 
-from gsseg_core.freed_memory import end_without_a_search, keep_freed_memory
+from gsseg_core.freed_memory import keep_freed_memory, search_no_imports_at_the_end
 from gsseg_core.live.living_session import LivingSession
 from gsseg_core.warm_up import warm_up
 from gsseg_ros.node import declarations, diagnostics, parameters
@@ -318,7 +318,7 @@ def _end(executor: NodeExecutor, node: SegmentNode) -> None:
 def main(args: list[str] | None = None) -> int:
     """Run the node until SIGINT or SIGTERM; returns the exit code: 0, or 2 for arguments that cannot be used."""
     keep_freed_memory()
-    end_without_a_search()
+    search_no_imports_at_the_end()
     make_room()
     # rclpy's own handlers would take the context away under a running job, and its spin() does not always notice.
     stop = threading.Event()
@@ -329,6 +329,7 @@ def main(args: list[str] | None = None) -> int:
         node = SegmentNode()
     except Exception as error:  # What ROS raises for arguments and parameters that it cannot take is not public.
         print(f"segment_node: error: {' '.join(str(error).split())}", file=sys.stderr)
+        rclpy.try_shutdown()
         return 2
     executor = NodeExecutor(node)
     # Not here: signals are heard in this thread, and to compile kernels takes half a minute and more.

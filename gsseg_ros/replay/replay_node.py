@@ -24,7 +24,7 @@ from rclpy.utilities import remove_ros_args
 from sensor_msgs.msg import CameraInfo, Image
 
 from gsseg_core.errors import GssegError, SettingsError
-from gsseg_core.freed_memory import end_without_a_search
+from gsseg_core.freed_memory import search_no_imports_at_the_end
 from gsseg_ros.conversions import stamp_message
 from gsseg_ros.replay.sources import TYPES, BagSource, FolderSource, Group, Source
 from gsseg_ros.shared_memory import make_room
@@ -272,7 +272,7 @@ def _with_parameters(args: list[str] | None) -> list[str]:
 
 def main(args: list[str] | None = None) -> int:
     """Run the node; exit code 0 when done or stopped by a signal, 2 for bad input."""
-    end_without_a_search()
+    search_no_imports_at_the_end()
     make_room()
     try:
         # rclpy's own handlers would take the context away in the middle of a publication.

@@ -5,6 +5,8 @@ from __future__ import annotations
 import contextlib
 import functools
 import signal
+import subprocess
+import sys
 import threading
 import time
 from pathlib import Path
@@ -168,3 +170,35 @@ def test_killed_while_it_learns_or_saves_the_earlier_state_loads_in_a_new_proces
     assert robot.done("load_state", path="state.npz").num_views == 150
     found = robot.exported(root / "out" / "loaded")
     np.testing.assert_array_equal(found.probabilities, saved.probabilities)
+
+
+TOLD_WHEN_IT_IS_GONE = """
+import sys
+from gsseg_ros.node import segment_node
+
+class Told(segment_node.SegmentNode):
+    def __del__(self):
+        print("the node is gone", flush=True)
+
+segment_node.SegmentNode = Told
+sys.exit(segment_node.main())
+"""
+
+
+@pytest.mark.parametrize(("ids", "code"), [("given", 0), ("per-view", 2)])
+def test_it_is_gone_before_python_ends(ros: Ros, ids: str, code: int) -> None:
+    """Threads of DDS that run on use what Python takes down: once in thousands of ends, that is a crash."""
+    parameters = [f"ids:={ids}", "class_names:=['wall', 'ball']", "autostart:=false"]
+    arguments = ["--ros-args", *(part for parameter in parameters for part in ("-p", parameter))]
+    process = subprocess.Popen(
+        [sys.executable, "-c", TOLD_WHEN_IT_IS_GONE, *arguments], env=ros.environment,
+        stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True,
+    )  # fmt: skip
+    with process, process.stdout as output:
+        said = []
+        for line in output:
+            said.append(line)
+            if "waiting to be configured" in line:
+                process.terminate()
+    assert process.returncode == code, said
+    assert said[-1] == "the node is gone\n"
