@@ -126,7 +126,7 @@ class StoringLearner(EMLearner):
 
     def _prepare(self, view: View, seen: SeenLabels) -> StoredWeights:
         operator = make_operator(self.scene, view.camera)
-        labels, evidence = self._used_labels(seen, operator)
+        labels, evidence, _ = self._used_labels(seen, operator)
         observation = StoredWeights(operator, labels, block_weights(labels, seen.labels))
         if evidence is not None:
             observation.evidence = evidence

@@ -34,10 +34,14 @@ _TIED = np.float32(0.01)  # of a step, by which equal probabilities may differ
 
 
 class SeenLabels(NamedTuple):
-    """Labels of a mask (H, W) int32, `UNKNOWN` where nothing is known, and their evidence; None if they are classes."""
+    """Labels of a mask (H, W) int32, `UNKNOWN` where nothing is known, and their evidence; None if they are classes.
+
+    `outermost` (L,) tells of each label which one is the whole that it is a part of in this mask; None if nothing does.
+    """
 
     labels: npt.NDArray[np.int32]
     evidence: LabelEvidence | None = None
+    outermost: npt.NDArray[np.int32] | None = None
 
     @property
     def largest(self) -> int:
@@ -79,7 +83,7 @@ class SeenLabels(NamedTuple):
     def _with_labels(self, labels: npt.NDArray[np.int32]) -> SeenLabels:
         """Replace the label image by another of the same prototypes, and drop those that no longer occur."""
         if self.evidence is None or self.evidence.mass is None:
-            return SeenLabels(labels, self.evidence)
+            return self._replace(labels=labels)
         return _tidied(labels, self.evidence.classes, self.evidence.mass, self.evidence.supervised, None)
 
     def numbered(self, ids: npt.NDArray[np.int32], source: str) -> SeenLabels:
@@ -136,10 +140,11 @@ class PackedMask:
 
     def __init__(self, seen: SeenLabels) -> None:
         self._labels, self._evidence, self.largest = PackedLabels(seen.labels), seen.evidence, seen.largest
+        self._outermost = seen.outermost
 
     def unpack(self) -> SeenLabels:
         """Return what was packed; the labels in memory of their own."""
-        return SeenLabels(self._labels.unpack(), self._evidence)
+        return SeenLabels(self._labels.unpack(), self._evidence, self._outermost)
 
     @property
     def digest(self) -> bytes:

@@ -309,7 +309,8 @@ class View:
     def _read_file(self) -> SeenLabels:
         """Read a mask from its file, in the size of the image as it was taken."""
         if self.foreign_mask is not None:
-            return SeenLabels(self.foreign_mask.labels(self.camera))
+            mask = self.foreign_mask.nested(self.camera)
+            return SeenLabels(mask.known(), outermost=mask.outermost)
         path = Path(self.source)
         if path.suffix.lower() != ".png":
             names = self.class_names if self.label_map is None else None

@@ -306,7 +306,8 @@ class Learner(ABC):
     def _lift(self, view: View, seen: SeenLabels, sign: int, operator: ViewOperator | None = None) -> bool:
         """Add a view's votes, or take them away, and keep nothing of it; tell whether it sees any Gaussian."""
         operator = operator or self._operator_of(view)
-        return operator.vote(*self._used_labels(seen, operator), self._votes, sign=sign)
+        used = self._used_labels(seen, operator)
+        return operator.vote(used.labels, used.evidence, self._votes, sign=sign)
 
     def _opened(self, view: View, operator: ViewOperator | None = None) -> Observation | UnusableViewError:
         """Prepare a new view; return the error that says why, where it cannot be used."""

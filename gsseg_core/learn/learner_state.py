@@ -139,7 +139,7 @@ class State:
             digests = b"".join(self.dropped[-_MOST_DROPPED:])
             arrays["dropped"] = np.frombuffer(digests, np.uint8).reshape(-1, DIGEST_BYTES)
         for i, view in enumerate(self.views):
-            arrays[f"labels_{i}"], evidence = view.read_seen()
+            arrays[f"labels_{i}"], evidence, _ = view.read_seen()
             if evidence is not None and evidence.mass is not None:
                 arrays[f"classes_{i}"], arrays[f"mass_{i}"] = evidence.classes, evidence.mass
                 if evidence.supervised is not None:

@@ -34,7 +34,7 @@ def votes_cast_anew(
     for view in state.views:
         operator = operator_of(view)
         seen = used(view.read_seen(), operator)
-        operator.vote(*seen, anew)
+        operator.vote(seen.labels, seen.evidence, anew)
         if not all_kept:
             _take(left, taken, operator, seen)
     cast = taken.rows()

@@ -52,7 +52,7 @@ from gsseg_core.objects.depth_edges import Borders
 from gsseg_core.objects.lifted_segments import Lifted
 from gsseg_core.objects.move_kernels import add_objects, by_view, explain_segments
 from gsseg_core.objects.sparse_products import product_above
-from gsseg_core.objects.stacked_segments import Stack, grouping
+from gsseg_core.objects.stacked_segments import Stack, Voters, grouping
 
 _BEST = 0.75  # pairs that agree nearly as well as the best one merge at once, before anything is compared anew
 _MOST = 0.6  # agreement above which clusters are one object whatever the segmenter does
@@ -137,15 +137,15 @@ def _merge(stack: Stack, settings: AssociationSettings) -> tuple[np.ndarray, flo
     All of the background are cluster 0, the others are numbered from 1.
     """
     start = _Clusters.single(stack)
-    single = start, _Votes.of(start, np.arange(len(start.seen)), stack.view, settings)
+    single = start, _Votes.of(start, np.arange(len(start.seen)), stack.voters, settings)
     sure = max(settings.agreement or 0, _MOST)
-    clusters, votes = _merged(*single, stack.view, sure, surface=0.0)
+    clusters, votes = _merged(*single, stack.voters, sure, surface=0.0)
     doubted = votes.doubted(_touching(stack, clusters))
     split = _in_parts(doubted)
     if split > 0:  # Begun again, so that depth edges count from the first pair on.
-        clusters, votes = _merged(*single, stack.view, sure, surface=split)
+        clusters, votes = _merged(*single, stack.voters, sure, surface=split)
     agreement = settings.agreement or votes.merging_level(doubted)
-    clusters, _ = _merged(clusters, votes, stack.view, agreement, surface=split)
+    clusters, _ = _merged(clusters, votes, stack.voters, agreement, surface=split)
     merged = np.zeros(len(stack.view), np.int64)
     merged[~stack.background] = clusters.of + 1
     return merged, agreement
@@ -155,7 +155,7 @@ class _Clusters(NamedTuple):
     """C clusters that A segments of objects make up, and what they have in common with all n segments."""
 
     of: np.ndarray  # (A,): the cluster of each
-    overlap: sparse.csr_matrix  # (A, n): O, that with the background left out
+    overlap: sparse.csr_matrix  # (A, n + W): O, that with the background left out, and with wholes
     seen: np.ndarray  # (C, views): V
     hidden: np.ndarray  # (C, views): what of it the view calls background
     borders: Borders  # of C clusters
@@ -174,7 +174,7 @@ class _Clusters(NamedTuple):
 
 
 def _merged(
-    clusters: _Clusters, votes: _Votes, view: np.ndarray, level: float, surface: float
+    clusters: _Clusters, votes: _Votes, voters: Voters, level: float, surface: float
 ) -> tuple[_Clusters, _Votes]:
     """Merge clusters down to a level, depth edges counting by `surface`, 0 to 1.
 
@@ -186,7 +186,7 @@ def _merged(
         unchanged = np.bincount(number) == 1
         changed = np.flatnonzero(~unchanged)
         clusters = clusters.merged(number)
-        votes = votes.replaced(alive[unchanged], changed, _Votes.of(clusters, changed, view, votes.settings))
+        votes = votes.replaced(alive[unchanged], changed, _Votes.of(clusters, changed, voters, votes.settings))
         pairs = pairs.among(number, unchanged).and_(votes.pairs(changed, clusters.borders, surface, level))
     return clusters, votes
 
@@ -212,18 +212,18 @@ class _Pairs(NamedTuple):
 class _Votes(NamedTuple):
     """How the views show C clusters."""
 
-    whole: sparse.csr_matrix  # (C, n) float32: how whole each segment shows each cluster, times what its view counts
+    whole: sparse.csr_matrix  # (C, n + W) float32: how whole each voter shows each, times what its view counts, shared
     counts: np.ndarray  # (C, views): 0 to 1, by how much of a cluster the view sees
     shown: np.ndarray  # (C, views): how whole the view shows it under any id, times counts
     settings: AssociationSettings
 
     @classmethod
-    def of(cls, clusters: _Clusters, which: np.ndarray, view: np.ndarray, settings: AssociationSettings) -> _Votes:
+    def of(cls, clusters: _Clusters, which: np.ndarray, voters: Voters, settings: AssociationSettings) -> _Votes:
         """Let the views vote on some clusters. Who calls a cluster background says nothing of which object it is."""
         seen = clusters.seen[which]
         foreground = np.maximum(seen - clusters.hidden[which], 0)
         counts = settings.sight(foreground, seen.max(axis=1, keepdims=True, initial=0))
-        groups = grouping(clusters.of)[which]
+        groups, view = grouping(clusters.of)[which], voters.view
         strong = product_above(groups, clusters.overlap, settings.least_share * foreground, view).tocoo()
         row, col = strong.row, strong.col
         share = strong.data / np.maximum(foreground[row, view[col]], 1e-9)
@@ -231,7 +231,8 @@ class _Votes(NamedTuple):
         whole = np.minimum(grown, 1) * counts[row, view[col]]
         shown = np.zeros_like(counts)
         np.maximum.at(shown, (row, view[col]), whole)
-        rows = sparse.csr_matrix((whole.astype(np.float32), (row, col)), shape=strong.shape)
+        shared = whole.astype(np.float32) * voters.share[col]
+        rows = sparse.csr_matrix((shared, (row, col)), shape=strong.shape)
         return cls(rows, counts, shown, settings)
 
     def replaced(self, kept: np.ndarray, changed: np.ndarray, by: _Votes) -> _Votes:

@@ -25,6 +25,7 @@ class Lifted:
     gaussians: np.ndarray  # (M,) int32: those that the segments are on, ascending
     weights: sparse.csr_matrix  # (L, M) float32: w_a, in px
     borders: Borders | None = None  # between them; None where nothing is known of the surface
+    wholes: np.ndarray | None = None  # (L,) int32: by segment, the id of the whole that it is a part of in its mask
 
     @classmethod
     def of(cls, observation: Observation, kept: float = 0.8) -> Lifted:
@@ -54,6 +55,13 @@ class Lifted:
         """Write out what stands where the weights do, for all Gaussians, (L, N), and not only those that are seen."""
         entries = data, self.gaussians[self.weights.indices], self.weights.indptr
         return sparse.csr_matrix(entries, shape=(len(self), num_gaussians))
+
+    def wholes_of_several(self) -> sparse.csr_matrix:
+        """Tell which segments make up each whole of several, (W, L) float32 of ones."""
+        number = np.unique(self.ids if self.wholes is None else self.wholes, return_inverse=True)[1]
+        rows = np.ones(len(self), np.float32), number, np.arange(len(self) + 1)
+        wholes = sparse.csr_matrix(rows, shape=(len(self), len(np.unique(number)))).T.tocsr()
+        return wholes[np.diff(wholes.indptr) > 1]
 
     def __len__(self) -> int:
         """Count the segments."""

@@ -141,7 +141,7 @@ class ObjectTable:
         opened = self._open(view)
         if opened is None:
             return None
-        operator, labels = opened
+        operator, labels, _ = opened
         observation = operator.observe(labels)
         if not observation.num_pairs:
             return None
@@ -295,21 +295,25 @@ class ObjectTable:
         opened = self._open(view, operator)
         if opened is None:
             return None
-        operator, labels = opened
+        operator, labels, outermost = opened
         seen = operator.lift(labels)
         if not len(seen.gaussians):
             return None
-        return Lifted.of_weights(seen, self.settings.kept).bordered(self.scene, operator, labels)
+        lifted = Lifted.of_weights(seen, self.settings.kept).bordered(self.scene, operator, labels)
+        return lifted if outermost is None else replace(lifted, wholes=outermost[lifted.ids])
 
-    def _open(self, view: View, operator: ViewOperator | None = None) -> tuple[ViewOperator, np.ndarray] | None:
-        """Make the operator of a view unless it is at hand, and read its labels; None where it has none."""
+    def _open(
+        self, view: View, operator: ViewOperator | None = None
+    ) -> tuple[ViewOperator, np.ndarray, np.ndarray | None] | None:
+        """Make the operator of a view unless it is at hand, and read its labels, with `outermost`; None without any."""
         if not view.has_mask:
             return None
         # Names of classes say nothing of ids that are a view's own.
-        labels = replace(view, class_names=None).read_labels()
+        seen = replace(view, class_names=None).read_seen()
+        labels = seen.named()
         if not (labels >= 0).any():
             return None
-        return operator or make_operator(self.scene, view.camera, self.device), labels
+        return operator or make_operator(self.scene, view.camera, self.device), labels, seen.outermost
 
     def _add(self, view: View, lifted: Lifted | None) -> bool:
         if lifted is None:

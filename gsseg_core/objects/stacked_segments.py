@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import NamedTuple
 
 import numpy as np
 from scipy import sparse
@@ -12,7 +13,15 @@ from gsseg_core.objects.depth_edges import Borders
 from gsseg_core.objects.lifted_segments import Lifted, sums, without_gaps
 from gsseg_core.objects.sparse_products import product_above
 
+_HALF = np.float32(np.sqrt(0.5))  # squared, what a vote by finest masks or by wholes is worth where there are both
 _LEAST = 0.01  # of what a view sees of a segment: what has no larger a share in common with it is taken for nothing
+
+
+class Voters(NamedTuple):
+    """Ids by which views vote: segments, and in views whose masks lie in others the wholes that these make up."""
+
+    view: np.ndarray  # (n + W,) int64
+    share: np.ndarray  # (n + W,) float32: root of what a vote is worth, of a whole and of a segment that is in one half
 
 
 class Stack:
@@ -27,6 +36,16 @@ class Stack:
         numbers = np.split(where, np.cumsum([len(view.gaussians) for view in views])[:-1])
         self.views = [replace(view, gaussians=ids) for view, ids in zip(views, numbers, strict=True)]
         self.num_gaussians = len(present)
+        self.wholes, self.voters = self._voters()
+
+    def _voters(self) -> tuple[sparse.csr_matrix, Voters]:
+        """Tell which segments make up each of the W wholes, (n, W) of ones, and who votes."""
+        wholes = [view.wholes_of_several() for view in self.views]
+        members = sparse.block_diag(wholes, format="csr").T.tocsr()
+        of_wholes = np.repeat(np.arange(len(wholes)), [part.shape[0] for part in wholes])
+        share = np.where(np.diff(members.indptr) > 0, _HALF, np.float32(1))
+        voters = Voters(np.append(self.view, of_wholes), np.append(share, np.full(len(of_wholes), _HALF)))
+        return members, voters
 
     def weights(self) -> sparse.csr_matrix:
         """Weights of the segments on the Gaussians, (n, I) float32, in px."""
@@ -53,8 +72,8 @@ class Stack:
 
         Returns
         -------
-        overlap : (A, n) float32
-            O; zero with background, and where it is next to nothing of what the other's view sees.
+        overlap : (A, n + W) float32
+            O, and its sums by whole; zero with background, and where it is next to nothing of what the view sees.
         seen, hidden : (A, views) float32
             V; and how much of that the view calls background.
         """
@@ -69,7 +88,8 @@ class Stack:
         hidden = np.zeros_like(seen)
         hidden[:, self.view[behind]] = (objects @ stacked[behind].T).toarray()
         stacked.data[np.repeat(self.background, np.diff(stacked.indptr))] = 0
-        return product_above(objects, stacked.T.tocsr(), _LEAST * seen, self.view), seen, hidden
+        overlap = product_above(objects, stacked.T.tocsr(), _LEAST * seen, self.view)
+        return sparse.hstack([overlap, overlap @ self.wholes], format="csr"), seen, hidden
 
     def _stacked(self, data: list[np.ndarray]) -> sparse.csr_matrix:
         """Stack what stands where the weights of each view do, (n, I)."""

@@ -9,6 +9,7 @@ object and for whole objects alike, so that one tree has all of them:
    each other" in one view and "both inside" in the next are votes on the same pair: what some views cut up and others
    show whole becomes parts that agree by the share of the views that show it whole.
 2. Objects merge in the same way, by how often views have them under one id.
+   A view whose masks lie in each other votes twice, by its segments and by the wholes that these make up.
 3. A region stays if three views or more show it as a segment: under one id that is it more than anything else, by an
    IoU above one half. What no view shows, as a rim of mixed Gaussians, goes to what it agrees with most.
 4. Every Gaussian goes to the part of its object that the ids on it speak for; one that no view has seen, to that of the
@@ -104,7 +105,8 @@ class _Segments:
         blocks = [sparse.csr_matrix((0, num_gaussians), dtype=np.float32)]
         for name in sorted(views):
             one = views[name]
-            blocks.append(one.of_all(num_gaussians, one.weights.data)[one.ids != 0])
+            every = one.of_all(num_gaussians, one.weights.data)
+            blocks += [every[one.ids != 0], one.wholes_of_several() @ every]
         stacked, counts = sparse.vstack(blocks, format="csr"), [block.shape[0] for block in blocks]
         view = np.unique(np.repeat(np.arange(len(blocks)), counts), return_inverse=True)[1]
         return cls(stacked.T.tocsr(), view, sums(stacked, 1), settings)

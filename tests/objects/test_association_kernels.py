@@ -16,16 +16,20 @@ from gsseg_core.objects.association import AssociationSettings, associate
 from gsseg_core.objects.lifted_segments import Lifted, Profiles
 from gsseg_core.objects.move_kernels import add_objects, by_view, explain_segments
 from gsseg_core.objects.sparse_products import product_above
-from gsseg_core.objects.stacked_segments import Stack
+from gsseg_core.objects.stacked_segments import Stack, Voters
 
 SETTINGS = AssociationSettings()
 WEIGHTS = sparse.csr_matrix(np.full((1, 2), 4, np.float32))
 
 
 def drawn_views(seed: int, num: int, background: bool) -> list[Lifted]:
-    """Views of a row of objects, cut up and merged; with background, the first segment of each view is that."""
+    """Views of a row of objects, cut up and merged; with background, the first segment of each view is that.
+
+    In some, segments are parts of wholes.
+    """
     rng = np.random.default_rng(seed)
     views = [row_of_objects(rng, 0.4, 0.15) for _ in range(num)]
+    views[::3] = [replace(view, wholes=view.ids - view.ids % 3 % 2) for view in views[::3]]
     return [replace(view, ids=np.arange(len(view))) for view in views] if background else views
 
 
@@ -66,20 +70,21 @@ def test_overlaps_are_those_of_the_formulas(background: bool) -> None:
     hidden = np.zeros_like(seen)
     hidden[:, stack.view[stack.background]] = overlap[:, stack.background]
     small = overlap <= 0.01 * seen[:, stack.view]
-    expected = np.where(small | stack.background, 0, overlap), seen, hidden
-    assert small.any()
+    overlap = np.where(small | stack.background, 0, overlap)
+    assert small.any() and stack.wholes.shape[1] > 4
+    expected = np.concatenate([overlap, overlap @ stack.wholes.toarray()], axis=1), seen, hidden
     for found, right in zip(stack.overlaps(), expected, strict=True):
         found = found.toarray() if sparse.issparse(found) else found
         np.testing.assert_allclose(found, right[~stack.background], rtol=1e-5, atol=1e-5)
 
 
 def merged_by_comparing_all_anew(
-    clusters: association._Clusters, votes: association._Votes, view: np.ndarray, level: float, surface: float
+    clusters: association._Clusters, votes: association._Votes, voters: Voters, level: float, surface: float
 ) -> tuple[association._Clusters, association._Votes]:
     """The twin of `_merged`."""
     while True:
         every = np.arange(len(clusters.seen))
-        votes = association._Votes.of(clusters, every, view, SETTINGS)
+        votes = association._Votes.of(clusters, every, voters, SETTINGS)
         pairs = votes.pairs(every, clusters.borders, surface, level)
         if not len(pairs.first):
             return clusters, votes
@@ -92,10 +97,10 @@ def merged_by_comparing_all_anew(
 def test_comparing_only_what_has_merged_gives_what_comparing_all_gives(seed: int, surface: float) -> None:
     stack = Stack(drawn_views(seed, 9, seed % 2 == 0))
     start = association._Clusters.single(stack)
-    votes = association._Votes.of(start, np.arange(len(start.seen)), stack.view, SETTINGS)
+    votes = association._Votes.of(start, np.arange(len(start.seen)), stack.voters, SETTINGS)
     for level in (0.6, 0.3):
-        found, found_votes = association._merged(start, votes, stack.view, level, surface)
-        twin, twin_votes = merged_by_comparing_all_anew(start, votes, stack.view, level, surface)
+        found, found_votes = association._merged(start, votes, stack.voters, level, surface)
+        twin, twin_votes = merged_by_comparing_all_anew(start, votes, stack.voters, level, surface)
         assert found.of.max() < start.of.max()
         np.testing.assert_array_equal(found.of, twin.of)
         for name in ("counts", "shown"):

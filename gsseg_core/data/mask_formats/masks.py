@@ -11,7 +11,7 @@ import numpy.typing as npt
 
 from gsseg_core.data.class_names import BACKGROUND_NAME, check_class_name
 from gsseg_core.data.label_images import UNKNOWN
-from gsseg_core.data.mask_formats.shapes import Drawing
+from gsseg_core.data.mask_formats.shapes import Drawing, Nested
 from gsseg_core.errors import MaskFormatError
 from gsseg_core.files.limits import MAX_LABEL
 from gsseg_core.scene.camera import Camera
@@ -30,7 +30,7 @@ class ViewMask:
     """
 
     where: str
-    read: Callable[[Camera], npt.NDArray[np.int32]]
+    read: Callable[[Camera], npt.NDArray[np.int32] | Nested]
     size: tuple[int, int] | None = None
     blank: bool = False
 
@@ -46,8 +46,13 @@ class ViewMask:
         Raises `MaskFormatError` where the mask is missing or broken, `MaskSizeError` where it has another shape than
         the camera's image.
         """
+        return self.nested(camera).labels
+
+    def nested(self, camera: Camera) -> Nested:
+        """Read the labels, and which lie in which, where a format tells; raises as `labels` does."""
         try:
-            return self.read(camera)
+            found = self.read(camera)
+            return found if isinstance(found, Nested) else Nested(found)
         except RecursionError as cause:  # Quoting what is nested goes less deep than reading it.
             raise MaskFormatError(f"{self.where}: is nested too deep; expected a mask") from cause
 

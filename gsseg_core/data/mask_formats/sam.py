@@ -1,24 +1,24 @@
 """Automatic masks of Segment Anything, as its `scripts/amg.py` writes them: a JSON list or a folder per image.
 
 Ids hold in their own view: mask i is i + 1. Where masks overlap, the smaller one is on top, so that a part shows on its
-whole; pixels in no mask are background.
+whole. Where most of an image has masks, the background has, too, and pixels in none are unknown: what there was fell
+short of what the generator asks for. Elsewhere they are background.
 """
 
 from __future__ import annotations
 
 import csv
+from collections.abc import Iterator
+from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 
-import numpy as np
-import numpy.typing as npt
-
-from gsseg_core.data.mask_formats.images import paint_objects
+from gsseg_core.data.mask_formats.images import read_object
 from gsseg_core.data.mask_formats.masks import MaskSet, ViewMask
 from gsseg_core.data.mask_formats.place import Place
 from gsseg_core.data.mask_formats.record import records
 from gsseg_core.data.mask_formats.rle import run_lengths
-from gsseg_core.data.mask_formats.shapes import Drawing, Runs, Shape
+from gsseg_core.data.mask_formats.shapes import Drawing, Nested, Part, Runs, Shape, paint_nested
 from gsseg_core.errors import MaskFormatError
 from gsseg_core.files.input_files import check_pixels
 from gsseg_core.files.json_files import read_json
@@ -55,11 +55,11 @@ def read_sam_folder(place: Place) -> MaskSet:
     return MaskSet(views, per_view=True)
 
 
-def _read_json(place: Place, path: Path, camera: Camera) -> npt.NDArray[np.int32]:
+def _read_json(place: Place, path: Path, camera: Camera) -> Nested:
     content = read_json(path, MaskFormatError, place.within)
     if content == []:  # Nothing was found in this image.
-        return np.zeros(camera.image_size[::-1], np.int32)
-    return _drawing(path, content).labels(camera, str(path))
+        return paint_nested([], *camera.image_size)
+    return _drawing(path, content).nested(camera, str(path))
 
 
 def _listed(content: object) -> list[object]:
@@ -94,7 +94,20 @@ def _folders(place: Place) -> dict[str, Path]:
     return place.views((path.name, path) for path in folders)
 
 
-def _read_folder(place: Place, folder: Path, camera: Camera) -> npt.NDArray[np.int32]:
+@dataclass(frozen=True, eq=False)
+class _Image:
+    """What one PNG covers of a camera's image."""
+
+    path: Path
+    camera: Camera
+    within: Path | None
+
+    def parts(self, width: int, height: int) -> Iterator[Part]:
+        """See `Region`."""
+        yield Part(0, 0, read_object(self.path, self.camera, self.within))
+
+
+def _read_folder(place: Place, folder: Path, camera: Camera) -> Nested:
     try:
         rows = list(csv.DictReader(place.text(folder / METADATA).splitlines()))
     except csv.Error as cause:
@@ -107,4 +120,5 @@ def _read_folder(place: Place, folder: Path, camera: Camera) -> npt.NDArray[np.i
                 f"{folder / METADATA}: has a mask {quoted(number)} of {quoted(area)} pixels; expected whole numbers"
             )
         masks.append((-int(area), int(number) + 1, folder / f"{int(number)}.png"))
-    return paint_objects([(label, path) for _, label, path in sorted(masks)], camera, place.within)
+    shapes = [Shape(label, _Image(path, camera, place.within)) for _, label, path in sorted(masks)]
+    return paint_nested(shapes, *camera.image_size)

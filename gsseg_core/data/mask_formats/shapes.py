@@ -7,7 +7,7 @@ each side.)
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
 from typing import NamedTuple, Protocol, TypeVar
@@ -15,6 +15,7 @@ from typing import NamedTuple, Protocol, TypeVar
 import numpy as np
 import numpy.typing as npt
 
+from gsseg_core.data.label_images import UNKNOWN
 from gsseg_core.data.mask_formats.rle import runs_to_mask
 from gsseg_core.errors import MaskFormatError, MaskSizeError
 from gsseg_core.files.input_files import check_pixels
@@ -28,6 +29,7 @@ T = TypeVar("T", bound=np.generic)
 _AT_ONCE = 2**18  # crossings of rows and edges that are worked on at a time
 _FEW = 2**16  # crossings that a polygon may have in an image of any size
 _RING_PIXELS = 2**16  # pixels that are filled in the time that any polygon takes by itself, however small
+_INSIDE = 0.9  # share of a shape that lies in another one, from which on it is a part of that
 
 
 class Part(NamedTuple):
@@ -203,10 +205,19 @@ class Drawing(NamedTuple):
         Raises `MaskFormatError` where a shape is broken, or there are more shapes than labels, and `MaskSizeError`
         where the image has another shape than the camera's.
         """
+        self._check(camera, where)
+        return scaled(paint(self.shapes, self.width, self.height), camera)
+
+    def nested(self, camera: Camera, where: str) -> Nested:
+        """Paint the labels as `paint_nested` does, scaled if need be; raises as `labels` does."""
+        self._check(camera, where)
+        painted = paint_nested(self.shapes, self.width, self.height)
+        return painted._replace(labels=scaled(painted.labels, camera))
+
+    def _check(self, camera: Camera, where: str) -> None:
         if len(self.shapes) > MAX_LABEL:
             raise MaskFormatError(f"{where}: has {len(self.shapes):,} shapes; expected at most {MAX_LABEL:,} in a view")
         check_fit(self.width, self.height, camera, where)
-        return scaled(paint(self.shapes, self.width, self.height), camera)
 
 
 def paint(shapes: Iterable[Shape], width: int, height: int) -> npt.NDArray[np.int32]:
@@ -217,6 +228,42 @@ def paint(shapes: Iterable[Shape], width: int, height: int) -> npt.NDArray[np.in
             rows, columns = inside.shape
             labels[top : top + rows, left : left + columns][inside] = label
     return labels
+
+
+class Nested(NamedTuple):
+    """Labels of shapes that may lie in each other."""
+
+    labels: npt.NDArray[np.int32]  # (H, W): 0 where there is no shape
+    outermost: npt.NDArray[np.int32] | None = None  # (L,): by label, that of the outermost shape it is a part of
+
+    def known(self) -> npt.NDArray[np.int32]:
+        """Return the labels, with `UNKNOWN` where shapes that were drawn of everything are missing.
+
+        Who draws shapes in each other and gives most of an image one has drawn everything, the background, too.
+        """
+        if self.outermost is None or 2 * np.count_nonzero(self.labels) <= self.labels.size:
+            return self.labels
+        return np.where(self.labels == 0, np.int32(UNKNOWN), self.labels)
+
+
+def paint_nested(shapes: Sequence[Shape], width: int, height: int) -> Nested:
+    """Paint shapes as `paint` does, of which none is larger than those before it.
+
+    A shape is a part of another one if nine tenths of it lie there.
+    """
+    labels = np.zeros((height, width), np.int32)
+    outermost = np.arange(1 + max((shape.label for shape in shapes), default=0), dtype=np.int32)
+    for label, region in shapes:
+        below = [np.zeros(0, np.int32)]
+        for top, left, inside in region.parts(width, height):
+            rows, columns = inside.shape
+            painted = labels[top : top + rows, left : left + columns]
+            below.append(outermost[painted[inside]])
+            painted[inside] = label
+        count = np.bincount(np.concatenate(below), minlength=1)
+        if count[1:].max(initial=0) >= max(_INSIDE * count.sum(), 1):
+            outermost[label] = 1 + count[1:].argmax()
+    return Nested(labels, outermost)
 
 
 def check_fit(width: int, height: int, camera: Camera, where: str) -> None:

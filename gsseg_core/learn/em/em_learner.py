@@ -268,7 +268,7 @@ class EMLearner(Learner):
         used = self._used_labels(seen, operator)
         # Without error models, what is wrong in few pixels would weigh too much: up to a point of mIoU was lost by it.
         weights = block_weights(used.labels, seen.hardened().labels) if self.settings.errors else None
-        return operator.observe(*used, weights)
+        return operator.observe(used.labels, used.evidence, weights)
 
     def _used_labels(self, seen: SeenLabels, operator: ViewOperator) -> SeenLabels:
         """Align boundaries of a plain mask with edges, and give each region a label if regions may be rejected."""
