@@ -28,7 +28,6 @@ from gsseg_core.cli.main import main
 from gsseg_core.csr_rows import CSRRows
 from gsseg_core.data.dataset import Dataset
 from gsseg_core.data.label_images import UNKNOWN, read_mask, write_mask
-from gsseg_core.data.soft_masks import SeenLabels
 from gsseg_core.data.view import View
 from gsseg_core.errors import SceneValueError, SettingsError
 from gsseg_core.learn.em.em_learner import EMLearner
@@ -112,34 +111,6 @@ def test_objects_that_some_views_merge_stay_two() -> None:
     right = [view for i, view in enumerate(VIEWS) if i % 4]
     assert agreement(table, right) == 1.0
     assert [table.objects_in(view.name).merged for view in VIEWS] == [1, 0, 0, 0, 1, 0, 0, 0]
-
-
-def in_halves_of_one_whole(view: View, wholes: tuple[int, ...]) -> View:
-    """The first ball under two ids; masks around some of the objects, of which all lies in one, have the id 1."""
-    cut = in_halves(view, 1).read_labels()
-    outermost = np.arange(cut.max() + 1, dtype=np.int32)
-    outermost[[*wholes]] = 1
-    return View.from_seen(view.camera, SeenLabels(cut, outermost=outermost))
-
-
-def test_parts_that_lie_in_a_mask_of_the_whole_are_one_object() -> None:
-    wholes = [in_halves_of_one_whole(view, (51,) if i % 8 else ()) for i, view in enumerate(clean_views(16))]
-    table = find_objects(SCENE, wholes)
-    assert table.num_objects == 3 and agreement(table, clean_views(16)) == 1.0
-    flat = find_objects(SCENE, [View.from_arrays(view.camera, view.read_labels()) for view in wholes])
-    assert flat.num_objects > 3
-
-
-def test_objects_that_lie_in_one_mask_while_each_has_its_own_stay_two() -> None:
-    """The halves of the first are one in a third of the views; it and the second are so in none."""
-    views = [
-        in_halves_of_one_whole(view, (51, 2)) if i % 3 else View.from_seen(
-            view.camera, SeenLabels(view.read_labels(), outermost=np.array([0, 1, 1, 3], np.int32))
-        )
-        for i, view in enumerate(clean_views(16))
-    ]  # fmt: skip
-    table = find_objects(SCENE, views)
-    assert table.num_objects == 3 and agreement(table, clean_views(16)) == 1.0
 
 
 def test_undoing_a_solve_brings_back_all_that_the_table_said_before() -> None:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 from collections.abc import Sequence
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -190,14 +189,6 @@ def test_objects_that_some_views_have_under_one_id_make_a_whole() -> None:
     tree = grown(views)
     assert tree.parents.tolist() == [-1, NUM_CLASSES, NUM_CLASSES, -1, -1]
     assert tree.agreement[NUM_CLASSES] == pytest.approx(0.3, abs=0.1)
-
-
-def test_objects_that_lie_in_one_mask_make_a_whole_of_half_that_agreement() -> None:
-    lifted = {v.name: Lifted.of(make_operator(SCENE, v.camera).observe(v.read_labels())) for v in VIEWS}
-    nested = {name: replace(view, wholes=np.where(view.ids == 2, 1, view.ids)) for name, view in lifted.items()}
-    tree = grow_tree(SCENE.means, TRUTH, NUM_CLASSES, nested, 0.6)
-    assert tree.parents.tolist() == [-1, NUM_CLASSES, NUM_CLASSES, -1, -1]
-    assert tree.agreement[NUM_CLASSES] == pytest.approx(0.5, abs=0.1)
 
 
 def test_views_that_agree_on_objects_make_neither_parts_nor_wholes() -> None:
