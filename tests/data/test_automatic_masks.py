@@ -12,12 +12,13 @@ from hypothesis import given, settings
 from hypothesis.extra.numpy import arrays
 from mask_writers import PER_VIEW_WRITERS, Writer
 from PIL import Image
-from test_mask_formats import HEIGHT, WIDTH, written
+from test_mask_formats import HEIGHT, STEMS, WIDTH, written
 
 from gsseg_core.data.dataset import Dataset
 from gsseg_core.data.label_images import UNKNOWN
 from gsseg_core.data.mask_formats.shapes import Bitmap, Shape, paint, paint_nested
 from gsseg_core.data.soft_masks import SeenLabels
+from gsseg_core.errors import MaskFormatError
 
 
 def automatic(root: Path, writer: Writer, *masks: np.ndarray) -> SeenLabels:
@@ -48,11 +49,17 @@ def test_of_automatic_masks_the_smaller_one_is_on_top_whatever_their_order(tmp_p
 
 @pytest.mark.parametrize("writer", PER_VIEW_WRITERS.values())
 @pytest.mark.parametrize(("right", "outside"), [(12, 0), (13, UNKNOWN)])
-def test_what_automatic_masks_leave_of_an_image_is_unknown_and_what_they_leave_of_a_half_is_background(
+def test_what_automatic_masks_leave_out_is_background_unless_they_cover_most_of_most_images(
     tmp_path: Path, writer: Writer, right: int, outside: int
 ) -> None:
-    labels = automatic(tmp_path, writer, box(0, 0, HEIGHT, right)).labels
-    assert (labels[:, :right] == 1).all() and (labels[:, right:] == outside).all()
+    place = tmp_path / written(tmp_path, writer, {stem: np.uint8(box(0, 0, HEIGHT, right)) for stem in STEMS})
+    *others, last = Dataset(tmp_path, place).views()
+    file = place / "frame_003.json"  # What is broken is told to who reads it, and nobody else.
+    (file if file.exists() else place / "frame_003/0.png").write_text("[{")
+    for view in others:
+        assert (view.read_labels()[:, :right] == 1).all() and (view.read_labels()[:, right:] == outside).all()
+    with pytest.raises(MaskFormatError):
+        last.read_labels()
 
 
 @pytest.mark.parametrize("writer", PER_VIEW_WRITERS.values())

@@ -38,13 +38,17 @@ def paint_objects(masks: Iterable[tuple[int, Path]], camera: Camera, within: Pat
     return labels
 
 
-def read_object(path: Path, camera: Camera, within: Path | None) -> npt.NDArray[np.bool_]:
-    """Read where a PNG of one channel is not 0, (H, W), scaled if need be; errors are those of `read_label_image`."""
+def read_object(path: Path, camera: Camera | None, within: Path | None) -> npt.NDArray[np.bool_]:
+    """Read where a PNG of one channel is not 0, (H, W), scaled to the size of a camera's image if need be.
+
+    Errors are those of `read_label_image`.
+    """
     with open_image(path, MaskFormatError, "mask", "a PNG of one object", ("PNG",), within) as image:
-        check_fit(*image.size, camera, str(path))
+        if camera is not None:
+            check_fit(*image.size, camera, str(path))
         if image.mode not in _MODES:
             raise MaskFormatError(
                 f"{path}: is an image of kind {image.mode}; expected one channel, 0 outside of the object"
             )
         inside = np.array(image) > 0
-    return scaled(inside, camera)
+    return inside if camera is None else scaled(inside, camera)

@@ -1,25 +1,28 @@
 """Automatic masks of Segment Anything, as its `scripts/amg.py` writes them: a JSON list or a folder per image.
 
 Ids hold in their own view: mask i is i + 1. Where masks overlap, the smaller one is on top, so that a part shows on its
-whole. Where most of an image has masks, the background has, too, and pixels in none are unknown: what there was fell
-short of what the generator asks for. Elsewhere they are background.
+whole. Where masks cover most of the images, the background has some, too, and pixels in none are unknown: what there
+was fell short of what the generator asks for. Else they are background.
 """
 
 from __future__ import annotations
 
 import csv
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
+from contextlib import suppress
 from dataclasses import dataclass
-from functools import partial
+from functools import cached_property, partial
 from pathlib import Path
+
+import numpy as np
 
 from gsseg_core.data.mask_formats.images import read_object
 from gsseg_core.data.mask_formats.masks import MaskSet, ViewMask
 from gsseg_core.data.mask_formats.place import Place
 from gsseg_core.data.mask_formats.record import records
 from gsseg_core.data.mask_formats.rle import run_lengths
-from gsseg_core.data.mask_formats.shapes import Drawing, Nested, Part, Runs, Shape, paint_nested
-from gsseg_core.errors import MaskFormatError
+from gsseg_core.data.mask_formats.shapes import Drawing, Nested, Part, Runs, Shape, paint, paint_nested
+from gsseg_core.errors import GssegError, MaskFormatError
 from gsseg_core.files.input_files import check_pixels
 from gsseg_core.files.json_files import read_json
 from gsseg_core.scene.camera import Camera
@@ -27,6 +30,7 @@ from gsseg_core.text import quoted
 
 METADATA = "metadata.csv"
 _MARKS = ("predicted_iou", "stability_score")
+_SOME = 9  # images, at most, that tell how much of all has masks
 
 
 def is_sam_json(place: Place) -> bool:
@@ -38,10 +42,9 @@ def is_sam_json(place: Place) -> bool:
 def read_sam_json(place: Place) -> MaskSet:
     """Read masks in JSON, a file per image: a list, or an object with the list `annotations`, as SA-1B has it."""
     files, size = place.by_view(".json"), _drawing(*place.sample)[:2]
-    return MaskSet(
-        {view: ViewMask(str(path), partial(_read_json, place, path), size) for view, path in files.items()},
-        per_view=True,
-    )
+    covered = _Covered(tuple(files.values()), partial(_share_of_json, place))
+    reads = {view: partial(_read_json, place, covered, path) for view, path in files.items()}
+    return MaskSet({view: ViewMask(str(files[view]), read, size) for view, read in reads.items()}, per_view=True)
 
 
 def is_sam_folder(place: Place) -> bool:
@@ -51,15 +54,43 @@ def is_sam_folder(place: Place) -> bool:
 
 def read_sam_folder(place: Place) -> MaskSet:
     """Read masks in PNGs, with their areas from `metadata.csv`."""
-    views = {view: ViewMask(str(path), partial(_read_folder, place, path)) for view, path in _folders(place).items()}
-    return MaskSet(views, per_view=True)
+    folders = _folders(place)
+    covered = _Covered(tuple(folders.values()), partial(_share_of_folder, place))
+    reads = {view: partial(_read_folder, place, covered, path) for view, path in folders.items()}
+    return MaskSet({view: ViewMask(str(folders[view]), read) for view, read in reads.items()}, per_view=True)
 
 
-def _read_json(place: Place, path: Path, camera: Camera) -> Nested:
+@dataclass(frozen=True)
+class _Covered:
+    """How much of the images has masks, by some of the files or folders of them."""
+
+    places: tuple[Path, ...]
+    share_of: Callable[[Path], float]
+
+    @cached_property
+    def most(self) -> bool:
+        """Whether masks cover more than half of the median image; what is broken does not count."""
+        shares = []
+        for path in self.places[:: max(-(-len(self.places) // _SOME), 1)]:
+            with suppress(GssegError):  # Who reads that mask is told.
+                shares.append(self.share_of(path))
+        return bool(np.median(shares or [0.0]) > 0.5)
+
+
+def _read_json(place: Place, covered: _Covered, path: Path, camera: Camera) -> Nested:
+    drawing = _opened(place, path) or Drawing(*camera.image_size, [])
+    return drawing.nested(camera, str(path))._replace(of_everything=covered.most)
+
+
+def _share_of_json(place: Place, path: Path) -> float:
+    drawing = _opened(place, path)
+    return 0.0 if drawing is None else float((paint(drawing.shapes, drawing.width, drawing.height) > 0).mean())
+
+
+def _opened(place: Place, path: Path) -> Drawing | None:
+    """Read the masks of an image; None where nothing was found in it."""
     content = read_json(path, MaskFormatError, place.within)
-    if content == []:  # Nothing was found in this image.
-        return paint_nested([], *camera.image_size)
-    return _drawing(path, content).nested(camera, str(path))
+    return None if content == [] else _drawing(path, content)
 
 
 def _listed(content: object) -> list[object]:
@@ -107,7 +138,21 @@ class _Image:
         yield Part(0, 0, read_object(self.path, self.camera, self.within))
 
 
-def _read_folder(place: Place, folder: Path, camera: Camera) -> Nested:
+def _read_folder(place: Place, covered: _Covered, folder: Path, camera: Camera) -> Nested:
+    shapes = [Shape(label, _Image(path, camera, place.within)) for label, path in _listed_in(place, folder)]
+    return paint_nested(shapes, *camera.image_size)._replace(of_everything=covered.most)
+
+
+def _share_of_folder(place: Place, folder: Path) -> float:
+    found = None
+    for _, path in _listed_in(place, folder):
+        inside = read_object(path, None, place.within)
+        found = inside if found is None or found.shape != inside.shape else found | inside
+    return 0.0 if found is None else float(found.mean())
+
+
+def _listed_in(place: Place, folder: Path) -> list[tuple[int, Path]]:
+    """List the masks in a folder with their labels, the largest first."""
     try:
         rows = list(csv.DictReader(place.text(folder / METADATA).splitlines()))
     except csv.Error as cause:
@@ -120,5 +165,4 @@ def _read_folder(place: Place, folder: Path, camera: Camera) -> Nested:
                 f"{folder / METADATA}: has a mask {quoted(number)} of {quoted(area)} pixels; expected whole numbers"
             )
         masks.append((-int(area), int(number) + 1, folder / f"{int(number)}.png"))
-    shapes = [Shape(label, _Image(path, camera, place.within)) for _, label, path in sorted(masks)]
-    return paint_nested(shapes, *camera.image_size)
+    return [(label, path) for _, label, path in sorted(masks)]

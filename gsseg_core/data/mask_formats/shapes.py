@@ -238,15 +238,11 @@ class Nested(NamedTuple):
 
     labels: npt.NDArray[np.int32]  # (H, W): 0 where there is no shape
     outermost: npt.NDArray[np.int32] | None = None  # (L,): by label, that of the outermost shape it is a part of
+    of_everything: bool = False  # whether the background has shapes, too, so that what has none is not known
 
     def known(self) -> npt.NDArray[np.int32]:
-        """Return the labels, with `UNKNOWN` where shapes that were drawn of everything are missing.
-
-        Who draws shapes in each other and gives most of an image one has drawn everything, the background, too.
-        """
-        if self.outermost is None or 2 * np.count_nonzero(self.labels) <= self.labels.size:
-            return self.labels
-        return np.where(self.labels == 0, np.int32(UNKNOWN), self.labels)
+        """Return the labels, with `UNKNOWN` where shapes that were drawn of everything are missing."""
+        return np.where(self.labels == 0, np.int32(UNKNOWN), self.labels) if self.of_everything else self.labels
 
 
 def paint_nested(shapes: Sequence[Shape], width: int, height: int) -> Nested:
