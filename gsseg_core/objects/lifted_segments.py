@@ -58,9 +58,9 @@ class Lifted:
 
     def wholes_of_several(self) -> sparse.csr_matrix:
         """Tell which segments make up each whole of several, (W, L) float32 of ones."""
-        number = np.unique(self.ids if self.wholes is None else self.wholes, return_inverse=True)[1]
+        found, number = np.unique(self.ids if self.wholes is None else self.wholes, return_inverse=True)
         rows = np.ones(len(self), np.float32), number, np.arange(len(self) + 1)
-        wholes = sparse.csr_matrix(rows, shape=(len(self), len(np.unique(number)))).T.tocsr()
+        wholes = sparse.csr_matrix(rows, shape=(len(self), len(found))).T.tocsr()
         return wholes[np.diff(wholes.indptr) > 1]
 
     def __len__(self) -> int:

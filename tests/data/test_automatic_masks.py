@@ -16,9 +16,10 @@ from test_mask_formats import HEIGHT, STEMS, WIDTH, written
 
 from gsseg_core.data.dataset import Dataset
 from gsseg_core.data.label_images import UNKNOWN
-from gsseg_core.data.mask_formats.shapes import Bitmap, Shape, paint, paint_nested
+from gsseg_core.data.mask_formats.shapes import Bitmap, Runs, Shape, paint, paint_nested
 from gsseg_core.data.soft_masks import SeenLabels
 from gsseg_core.errors import MaskFormatError
+from gsseg_core.files.limits import MAX_LABEL
 
 
 def automatic(root: Path, writer: Writer, *masks: np.ndarray) -> SeenLabels:
@@ -82,6 +83,21 @@ def test_an_image_in_which_automatic_masks_found_nothing_is_all_background(tmp_p
     (place / "frame_001.json").write_text("[]")  # the first, by which a format is recognised
     first, second, _ = Dataset(tmp_path, place).views()
     assert not first.read_labels().any() and second.read_labels().any()
+
+
+def test_a_file_of_more_masks_than_there_are_labels_is_not_painted_for_other_views(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    everything = {stem: np.ones((HEIGHT, WIDTH), np.uint8) for stem in STEMS}
+    place = tmp_path / written(tmp_path, mask_writers.sam_json, everything)
+    file = place / "frame_003.json"
+    file.write_text(json.dumps(json.loads(file.read_text()) * (MAX_LABEL + 1)))
+    painted, parts = [], Runs.parts
+    monkeypatch.setattr(Runs, "parts", lambda runs, *size: painted.append(runs) or parts(runs, *size))
+    first, *_, last = Dataset(tmp_path, place).views()
+    assert first.read_labels().all() and len(painted) <= 3  # the two files that can be read, and the first once more
+    with pytest.raises(MaskFormatError, match=r"frame_003\.json: has 65,535 shapes; expected at most 65,534"):
+        last.read_labels()
 
 
 @given(arrays(bool, (6, HEIGHT, WIDTH)))

@@ -21,7 +21,7 @@ from gsseg_core.data.mask_formats.masks import MaskSet, ViewMask
 from gsseg_core.data.mask_formats.place import Place
 from gsseg_core.data.mask_formats.record import records
 from gsseg_core.data.mask_formats.rle import run_lengths
-from gsseg_core.data.mask_formats.shapes import Drawing, Nested, Part, Runs, Shape, paint, paint_nested
+from gsseg_core.data.mask_formats.shapes import Drawing, Nested, Part, Runs, Shape, paint_nested
 from gsseg_core.errors import GssegError, MaskFormatError
 from gsseg_core.files.input_files import check_pixels
 from gsseg_core.files.json_files import read_json
@@ -72,7 +72,7 @@ class _Covered:
         """Whether masks cover more than half of the median image; what is broken does not count."""
         shares = []
         for path in self.places[:: max(-(-len(self.places) // _SOME), 1)]:
-            with suppress(GssegError):  # Who reads that mask is told.
+            with suppress(GssegError, RecursionError):  # Who reads that mask is told.
                 shares.append(self.share_of(path))
         return bool(np.median(shares or [0.0]) > 0.5)
 
@@ -84,7 +84,7 @@ def _read_json(place: Place, covered: _Covered, path: Path, camera: Camera) -> N
 
 def _share_of_json(place: Place, path: Path) -> float:
     drawing = _opened(place, path)
-    return 0.0 if drawing is None else float((paint(drawing.shapes, drawing.width, drawing.height) > 0).mean())
+    return 0.0 if drawing is None else drawing.covered(str(path))
 
 
 def _opened(place: Place, path: Path) -> Drawing | None:

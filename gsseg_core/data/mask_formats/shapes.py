@@ -217,10 +217,18 @@ class Drawing(NamedTuple):
         painted = paint_nested(self.shapes, self.width, self.height)
         return painted._replace(labels=scaled(painted.labels, camera))
 
+    def covered(self, where: str) -> float:
+        """Tell the share of the image that has a shape; raises `MaskFormatError` as `labels` does."""
+        self._check_count(where)
+        return float((paint(self.shapes, self.width, self.height) > 0).mean())
+
     def _check(self, camera: Camera, where: str) -> None:
+        self._check_count(where)
+        check_fit(self.width, self.height, camera, where)
+
+    def _check_count(self, where: str) -> None:
         if len(self.shapes) > MAX_LABEL:
             raise MaskFormatError(f"{where}: has {len(self.shapes):,} shapes; expected at most {MAX_LABEL:,} in a view")
-        check_fit(self.width, self.height, camera, where)
 
 
 def paint(shapes: Iterable[Shape], width: int, height: int) -> npt.NDArray[np.int32]:
