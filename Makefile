@@ -72,7 +72,9 @@ lint: | $(ROS_READY)
 run-fast-tests: $(KERNELS_READY)
 	$(BIN)/python -m pytest -q -W error --numprocesses=2 --dist=worksteal -m 'not processes'
 
+# Once, before the workers: each of them would compile all tests, all at the same time.
 run-tests:
+	@$(BIN)/python -m pytest -q --collect-only >/dev/null || true
 	$(BIN)/python -m pytest -W error --durations=20 --numprocesses=$(TEST_WORKERS) --dist=loadfile --no-loadscope-reorder
 
 docs: $(READY)  ## build the documentation into site/index.html, and refuse links that lead nowhere
