@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shutil
 import subprocess
 import sys
 from pathlib import Path
@@ -22,14 +23,21 @@ FILES = {
 CALL = "from made.kernels import double; print(double(3), sum(double.stats.cache_hits.values()))"
 
 
-@pytest.fixture
-def package(tmp_path: Path) -> Path:
+@pytest.fixture(scope="module")
+def compiled(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Write a package with a kernel, and have it compiled."""
-    (tmp_path / "made").mkdir()
+    folder = tmp_path_factory.mktemp("compiled")
+    (folder / "made").mkdir()
     for name, content in FILES.items():
-        (tmp_path / "made" / f"{name}.py").write_text(content)
-    assert called_from(tmp_path) == "8 0" and called_from(tmp_path) == "8 1"
-    return tmp_path
+        (folder / "made" / f"{name}.py").write_text(content)
+    assert called_from(folder) == "8 0" and called_from(folder) == "8 1"
+    return folder
+
+
+@pytest.fixture
+def package(compiled: Path, tmp_path: Path) -> Path:
+    """Copy that package, with what was compiled: kernels are known by what stands in their sources."""
+    return shutil.copytree(compiled, tmp_path, dirs_exist_ok=True)
 
 
 def called_from(folder: Path, call: str = CALL) -> str:
