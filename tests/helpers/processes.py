@@ -21,7 +21,7 @@ MARKER = "processes"
 STARTERS = {"browser", "children", "distributed", "gsseg_ros.child_nodes", "multiprocessing", "subprocess"}
 EVENTS = {"subprocess.Popen", "os.posix_spawn", "os.system", "os.exec"}
 HERE = str(Path(__file__).parents[1])
-_may_start = True
+_refused = False  # When Python ends it becomes None, which refuses nothing either.
 
 
 def mark(items: Iterable[pytest.Item]) -> None:
@@ -71,14 +71,14 @@ def refuse_events(event: str, arguments: tuple[Any, ...]) -> None:
     """Fail the test that forks, or starts a process though nobody could see that it would: an audit hook of Python."""
     if event in ("os.fork", "os.forkpty"):
         pytest.fail("it forks the process of all tests, whose threads a child lacks: see helpers/clean_process.py")
-    if not _may_start and event in EVENTS and arguments[:1] != ("uname",):  # Of Python's own module platform.
+    if _refused and event in EVENTS and arguments[:1] != ("uname",):  # Of Python's own module platform.
         pytest.fail(f"it starts a process ({event}) and so needs @pytest.mark.{MARKER}: {arguments[:2]}")
 
 
 def allow(yes: bool) -> None:
     """Say whether the test that runs now may start processes."""
-    global _may_start
-    _may_start = yes
+    global _refused
+    _refused = not yes
 
 
 def _functions(item: pytest.Function) -> Iterator[Any]:
