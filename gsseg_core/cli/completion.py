@@ -20,7 +20,7 @@ EXAMPLES = """
 """
 
 _FOLDERS = {"DIR", "DATASET", "OUT"}
-_FILES = {"FILE", "SCENE"}
+_FILES = {"FILE", "SCENE", "STATE", "PATH"}  # and folders, too
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:

@@ -120,7 +120,9 @@ def test_bash_completes_commands_options_choices_and_folders(
     assert offered("gsseg", "segment", "--memory") == {"--memory-budget"}
     assert offered("gsseg", "segment", "--learner", "v") == {"votes"}
     assert {word.rstrip("/") for word in offered("gsseg", "eval", "--pred", "cap")} == {"capture"}
-    assert "capture.ply" in offered("gsseg", "segment", "cap")
+    every = {"capture", "capture.ply"}
+    for before in (["segment"], ["segment", "--labels"], ["eval", "--truth"], ["merge"], ["doctor"]):
+        assert {word.rstrip("/") for word in offered("gsseg", *before, "cap")} == every, before
 
 
 def test_a_missing_shtab_is_one_line_that_says_what_to_type(
