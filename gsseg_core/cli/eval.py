@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import os
 from contextlib import suppress
 from pathlib import Path
 
@@ -42,7 +43,7 @@ def run(options: argparse.Namespace) -> int:
     if options.json:
         check_writable(options.json)
         check_replaceable(Path(options.json), "file of scores", _holds_scores(Path(options.json)))
-    root = Path(options.truth).parent
+    root = Path(os.path.abspath(options.truth)).parent  # The folder may be called "." or end in "..".
     classes = root / "classes.json"
     names = read_classes(classes) if is_there(classes, ClassesFileError) else None
     cameras = read_cameras(root) if find_cameras(root) else []

@@ -100,6 +100,19 @@ def test_eval_says_that_ids_are_others_than_the_true_ones(place: Path, capsys: p
     assert main(scores) == 2 and "name them as test in split.json" in capsys.readouterr().err
 
 
+def test_scores_are_the_same_from_within_the_folder_of_the_truth(
+    place: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    labels = place / "data/labels"
+    assert main(["eval", "--pred", f"{labels}", "--truth", f"{labels}"]) == 0
+    told = capsys.readouterr().out
+    monkeypatch.chdir(labels)
+    assert main(["eval", "--pred", f"{labels}", "--truth", "."]) == 0 and capsys.readouterr().out == told
+    (labels / "below").mkdir()
+    monkeypatch.chdir("below")
+    assert main(["eval", "--pred", f"{labels}", "--truth", ".."]) == 0 and capsys.readouterr().out == told
+
+
 def test_a_view_called_like_the_legend_keeps_its_overlay(place: Path) -> None:
     cameras = place / "data/cameras.json"
     cameras.write_text(cameras.read_text().replace("view2", "legend"))
