@@ -102,11 +102,20 @@ def note_frame(options: argparse.Namespace) -> None:
     with suppress(GssegError, KeyError, TypeError):  # There may be no report, or one of a run that moved none.
         frame = read_object(report, GssegError, "a report")["frame"]
         file = frame["dataparser"] and Path(frame["dataparser"])
-        if file and not (options.dataparser or file.parent in (Path(options.scene).parent, Path(options.data))):
+        if file and not (options.dataparser or _is_found(file, options)):
             note(f"{report}: that run moved the cameras by {file}, and here they are not; try --dataparser {file}")
         found = "; ".join(frame["alignment"]["found"])
         if found and not options.align:
             note(f"{report}: that run moved the cameras by --align ({found}), and here they are not; try --align")
+
+
+def _is_found(file: Path, options: argparse.Namespace) -> bool:
+    """Whether the file of nerfstudio that a run took is the one that is found here; it may be named from elsewhere."""
+    from gsseg_core.data.camera_formats.dataparser import DATAPARSER
+
+    beside = (os.path.join(folder, DATAPARSER) for folder in (Path(options.scene).parent, options.data))
+    found = next(filter(os.path.exists, beside), None)
+    return found is not None and (os.path.samefile(file, found) if os.path.exists(file) else file.name == DATAPARSER)
 
 
 def load_kernels(quiet: bool, device: str = "cpu") -> None:

@@ -149,11 +149,26 @@ def test_a_truncated_file_is_refused_wherever_it_ends(tmp_path: Path) -> None:
             frame_of_training(tmp_path, tmp_path / "dp.json")
 
 
-@pytest.mark.parametrize(("scene", "given", "notes"), [("here", None, 1), ("away", None, 0), ("here", "file", 0)])
+@pytest.mark.parametrize(
+    ("scene", "named", "given", "notes"),
+    [
+        ("here", "away/dataparser_transforms.json", None, 1),
+        ("away", "away/dataparser_transforms.json", None, 0),
+        ("here", "away/dataparser_transforms.json", "file", 0),
+        ("away", "other_folder/../away/dataparser_transforms.json", None, 0),
+        ("away", "as_named_from_elsewhere/dataparser_transforms.json", None, 0),
+        ("here", "of_another_name.json", None, 1),
+        ("away", "of_another_name.json", None, 1),
+    ],
+)
 def test_a_command_says_so_where_the_run_was_told_of_a_file_and_it_is_not(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str], scene: str, given: str | None, notes: int
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], scene: str, named: str, given: str | None, notes: int
 ) -> None:
-    file = tmp_path / "away/dataparser_transforms.json"
+    for folder in ("away", "other_folder"):
+        (tmp_path / folder).mkdir()
+    for name in ("away/dataparser_transforms.json", "of_another_name.json"):
+        write_json(tmp_path / name, {})
+    file = tmp_path / named
     write_json(tmp_path / "report.json", {"frame": {"dataparser": str(file), "alignment": None}})
     paths = {"scene": tmp_path / scene / "scene.ply", "data": tmp_path, "segmentation": tmp_path / "segmentation.npz"}
     note_frame(Namespace(**paths, align=False, dataparser=given))
