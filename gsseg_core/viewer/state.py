@@ -192,9 +192,9 @@ class ViewerState:
         with self.lock:
             objects, tree, read = self.objects, self.model.tree, self.model.read
             ids = self.model.ids() if tree is None else at_level(objects, tree, tree.level).nodes
-        labels, told, names, _ = objects
+        (labels, told, names, _), scene = objects, self.model.scene
         shares, nothing = completed(told, len(names)), np.zeros(len(labels), bool)
-        result = Segmentation(labels, shares, names, self.model.scene.digest, nothing, CSRRows.empty(0))
+        result = Segmentation(labels, shares, names, scene.digest, nothing, CSRRows.empty(0), ids=scene.ids)
         if read is not None:  # What blends into views is what was learnt, but for what was corrected.
             now, then = told.united(read.shares)
             same = now.with_data(now.data != then.data).sums() == 0

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from contextlib import AbstractContextManager, nullcontext
+from io import BytesIO
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -18,6 +19,8 @@ from small_scenes import NAMES, balls_on_a_table, ring
 from gsseg_core.errors import SettingsError, UnknownLabelError
 from gsseg_core.export.pictures import FILL
 from gsseg_core.raster.backends import make_operator
+from gsseg_core.scene.living_scene import LivingScene
+from gsseg_core.scene.scene_delta import SceneDelta
 from gsseg_core.segmentation import REMOVED, UNOBSERVED, Segmentation
 from gsseg_core.viewer.model import (
     BY_CLASS,
@@ -325,6 +328,13 @@ def test_what_is_saved_blends_into_views_as_what_was_read_but_for_what_was_corre
     assert state.correct(disc(camera, *uv, 3, K)) > 0
     labels = saved().label_map(operator)
     assert labels[int(uv[1]), int(uv[0])] == K and (labels == read.label_map(operator)).mean() > 0.9
+
+
+def test_ids_of_a_scene_that_changes_are_saved() -> None:
+    grown = LivingScene.of(SCENE).apply(SceneDelta(removed=np.array([0])))[0].scene
+    _, content = ViewerState(ViewModel(grown, Labelling.unknown(N - 1)), [], {}, "cpu").segmentation_npz()
+    with np.load(BytesIO(content)) as saved:
+        np.testing.assert_array_equal(saved["ids"], np.arange(1, N))
 
 
 def test_a_class_that_was_added_stays_apart_from_those_that_turn_up_in_a_live_source_and_joins_its_namesake() -> None:
