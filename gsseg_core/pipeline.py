@@ -16,7 +16,7 @@ from gsseg_core.data.hints import FRAME_HINT, mask_hint
 from gsseg_core.data.label_images import GLOBAL, PER_VIEW, write_mask
 from gsseg_core.data.view import QUALITIES, spread
 from gsseg_core.errors import NoUsableViewsError, SettingsError
-from gsseg_core.export.pictures import save_png
+from gsseg_core.export.pictures import CELL_PX, save_png, shrunk
 from gsseg_core.export.summary import RunSettings
 from gsseg_core.export.view_pictures import Drawn, draw_views, look_and_draw, view_file_name, write_overview
 from gsseg_core.files.json_files import write_json
@@ -311,7 +311,7 @@ def render(
         drawn, save = draw_views(scene, numbered, views, device=device), partial(save_png, run=run.id)
         for name, (_, labels, image, _) in zip(with_progress(progress, "render", names), drawn, strict=True):
             write_mask(run.folder / name, ids[labels], bits, run.id)
-            overlays.append(image)
+            overlays.append(shrunk(image, CELL_PX))  # As the contact sheet has it; of all views, memory is for no more.
             save(run.folder / pictures[name], image)
         write_overview(numbered, overlays, [view.name for view in views], run.folder / "overlays", save)
     return [Path(out) / name for name in names]

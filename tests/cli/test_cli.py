@@ -86,6 +86,25 @@ def test_render_and_eval_score_the_views_that_were_not_learnt_from(
     assert len(list((place / "maps").glob("*.png"))) == 6
 
 
+def test_pictures_of_all_views_are_kept_no_larger_than_they_are_shown_together(
+    place: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    cameras = json.loads((place / "data/cameras.json").read_text())
+    large = [{**one, **{name: 10 * one[name] for name in ("width", "height", "fx", "fy")}} for one in cameras]
+    (place / "data/cameras.json").write_text(json.dumps(large))
+    kept, write = list[int](), pipeline.write_overview
+
+    def look(result: Segmentation, images: list[np.ndarray], *others: Any) -> list[Path]:
+        kept.extend(max(image.shape) for image in images)
+        return write(result, images, *others)
+
+    monkeypatch.setattr(pipeline, "write_overview", look)
+    npz, scene = f"{place}/out/segmentation.npz", f"{place}/data/scene.ply"
+    render = ["render", scene, "--data", f"{place}/data", "--segmentation", npz, "--out", f"{place}/maps", "--quiet"]
+    assert main(render) == 0 and kept == [480, 480]
+    assert read_mask(place / "maps/view2.png").labels.shape[1] == large[2]["width"]
+
+
 def test_eval_says_that_ids_are_others_than_the_true_ones(place: Path, capsys: pytest.CaptureFixture[str]) -> None:
     shutil.copytree(place / "data/labels", place / "found")
     scores = ["eval", "--pred", f"{place}/found", "--truth", f"{place}/data/labels"]
