@@ -65,7 +65,8 @@ def run(options: argparse.Namespace) -> int:
     rest = left_without(scene, segmentation, chosen)
     left = np.where(rest, segmentation.labels, REMOVED)
     with progress_bars(options.quiet) as progress:
-        meshes = collision_meshes(scene, left, segmentation.confidence, options.collision, progress)
+        made = collision_meshes(scene, left, segmentation.confidence, options.collision, progress)
+    meshes = made if options.collision else None
     write_selection(scene, rest, segmentation.labels, segmentation.class_names, options.out, scene_format, meshes)
     removed = listed(f"{k} ({clipped(names[k])})" for k in chosen)
     tell(f"without {removed}: {int(rest.sum()):,} of {counted(len(scene), 'Gaussian')} in {options.out}")

@@ -116,7 +116,7 @@ def write_selection(
     class_names: Mapping[int, str],
     path: str | os.PathLike[str],
     scene_format: str,
-    meshes: Mapping[int, TriangleMesh],
+    meshes: Mapping[int, TriangleMesh] | None,  # None where none were asked for
 ) -> None:
     """Write some Gaussians of a scene as one file, in which USD keeps the classes of these labels apart.
 
@@ -129,14 +129,14 @@ def write_selection(
         stem = stem_of(path, scene_format)
         places = {k: Path(path).with_name(f"{stem}_{mesh_file_name(k, name)}") for k, name in class_names.items()}
         with ExitStack() as written:  # Meshes get their names once the scene has its own.
-            for k, mesh in meshes.items():
+            for k, mesh in (meshes or {}).items():
                 mesh.write(written.enter_context(write_atomically(places[k])))
             write_scene(part, path, scene_format)
-        for k in places.keys() - meshes.keys() if meshes else ():
+        for k in () if meshes is None else places.keys() - meshes.keys():
             _remove_mesh(places[k])
         return
     labels = labels[chosen]
-    objects = _objects(part, _members(labels), class_names, meshes)
+    objects = _objects(part, _members(labels), class_names, meshes or {})
     if (labels < 0).any():
         objects.append(SceneObject(part.subset(labels < 0)))
     write_objects(objects, path, scene_format)

@@ -184,7 +184,7 @@ class ViewerState:
         known = {ids[k]: text for k, text in names.items()}
         meshes = collision_meshes(scene, np.where(shown, given, REMOVED), confidence, collision)
         return name, _as_file(
-            lambda path: write_selection(scene, shown, given, known, path, scene_format, meshes), name
+            lambda path: write_selection(scene, shown, given, known, path, scene_format, meshes or None), name
         )
 
     def segmentation_npz(self) -> tuple[str, bytes]:

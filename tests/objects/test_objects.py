@@ -370,6 +370,10 @@ def test_meshes_beside_what_is_left_are_of_that_and_of_nothing_before(
     del before["rest_2_cup_mug.obj"]
     assert remove("box", "--collision") == 2 and "rest_2_cup_mug.obj" in capsys.readouterr().err
     assert {path.name: path.read_bytes() for path in out.iterdir() if path.is_file()} == before
+    (out / "rest_2_cup_mug.obj").rmdir()
+    every = ["--class", "red ball", "--class", "cup/mug", "--collision"]
+    assert remove("box", *every) == 0  # Of what is left, there is no mesh.
+    assert sorted(path.name for path in out.iterdir()) == sorted(["rest.ply", *others])
 
 
 def test_gsseg_segment_carves_when_asked_to(tmp_path: Path) -> None:
