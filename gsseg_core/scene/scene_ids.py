@@ -8,6 +8,7 @@ import numpy as np
 import numpy.typing as npt
 
 from gsseg_core.errors import SceneDeltaError, SceneValueError
+from gsseg_core.scene.vertices import rest_of
 
 LOW, HIGH = "id_low", "id_high"  # properties uint of a vertex: the lower and the upper half of its id
 
@@ -49,8 +50,11 @@ def with_ids(
                 f"scene delta: added Gaussians have {len(beyond)} coefficients of SH more than the scene; expected "
                 "the degree of the scene at most"
             )
+        bands, room = len(rest_of(added)) // 3, len(rest_of(vertices)) // 3
+        # All of red comes first, then green, then blue: where there is room for more bands, the latter begin later.
+        places = {f"f_rest_{i}": f"f_rest_{i // bands * room + i % bands}" for i in range(3 * bands)}
         for name in set(given) & {name for name, _ in kinds}:
-            out[name][len(vertices) :] = added[name]
+            out[places.get(name, name)][len(vertices) :] = added[name]
     for name, _ in kinds:
         out[name][: len(vertices)] = vertices[name]
     out[LOW], out[HIGH] = ids & 0xFFFFFFFF, ids >> 32

@@ -124,6 +124,19 @@ def test_what_is_added_may_not_have_more_colours_than_the_scene_has_room_for() -
     assert after.scene.sh_degree == 1 and not after.scene.sh[-20:, 1:].any()
 
 
+def test_what_is_added_with_fewer_bands_of_sh_than_the_scene_keeps_its_colours() -> None:
+    rng, wide = np.random.default_rng(3), [SCENE.means, SCENE.quats, SCENE.scales, SCENE.opacities]
+    scene = GaussianScene.from_arrays(*wide, rng.normal(size=(len(SCENE), 16, 3)))
+    sh = rng.normal(size=(20, 4, 3)).astype(np.float32)
+    part = GaussianScene.from_arrays(PART.means, PART.quats, PART.scales, PART.opacities, sh)
+    after, _ = LivingScene.of(scene).apply(
+        SceneDelta(added=part, added_ids=np.arange(20) + 900, added_groups=np.zeros(20, np.int64))
+    )
+    np.testing.assert_array_equal(after.scene.sh[:-20], scene.sh)
+    np.testing.assert_array_equal(after.scene.sh[-20:, :4], sh)
+    assert not after.scene.sh[-20:, 4:].any()
+
+
 @pytest.mark.parametrize("revision", ["a", 1.5])
 def test_a_revision_is_a_whole_number(revision: object) -> None:
     with pytest.raises(SceneDeltaError, match=f"revision is '?{revision}'?; expected a whole number"):
