@@ -93,7 +93,7 @@ class ScratchFile:
         """Forget an object, if there is one of that name; its space is used again."""
         place = self._places.pop(name, None)
         if place is not None:
-            self._holes.append((place.offset, place.size))
+            self._add_hole(place.offset, place.size)
         if not self._places:
             self.clear()
 
@@ -104,6 +104,17 @@ class ScratchFile:
         if self._file is not None:
             self._file.close()
             self._file = None
+
+    def _add_hole(self, offset: int, size: int) -> None:
+        """Note a hole, as one with those beside it: what is left of holes would soon fit nothing, and the file grow."""
+        holes = sorted([*self._holes, (offset, size)])
+        self._holes = holes[:1]
+        for begin, capacity in holes[1:]:
+            last, before = self._holes[-1]
+            if last + before == begin:
+                self._holes[-1] = (last, before + capacity)
+            else:
+                self._holes.append((begin, capacity))
 
     def _find_space(self, size: int) -> int:
         """Find the offset at which so many bytes fit: in a hole, or at the end; `OSError` if the disk has no space."""

@@ -63,6 +63,16 @@ def test_space_of_what_was_dropped_is_used_again() -> None:
     np.testing.assert_array_equal(scratch.get("a"), np.full(1000, 19))
 
 
+def test_the_file_stays_small_however_long_objects_of_all_sizes_come_and_go() -> None:
+    scratch, sizes = ScratchFile(), np.random.default_rng(0).integers(100, 200, 2000).tolist()
+    for number, size in enumerate(sizes):
+        scratch.drop(str(number - 20))
+        assert scratch.put(str(number), np.full(size, number % 256, np.uint8))
+    assert scratch._file is not None and os.fstat(scratch._file.fileno()).st_size < 2 * scratch.nbytes
+    for number in range(1980, 2000):
+        np.testing.assert_array_equal(scratch.get(str(number)), np.full(sizes[number], number % 256, np.uint8))
+
+
 def test_no_file_can_be_seen_and_a_copy_begins_empty(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("TMPDIR", str(tmp_path))
     scratch = ScratchFile()
