@@ -8,7 +8,9 @@ loaded is its machine code; its bitcode is read when another that calls it is co
 
 from __future__ import annotations
 
+import pickle
 from collections.abc import Callable
+from contextlib import suppress
 from typing import Any
 
 import llvmlite.binding as llvm
@@ -110,7 +112,13 @@ class _KernelCache(FunctionCache):
             return self._load_overload(sig, target_context)
         except (AttributeError, ImportError):  # It was compiled for a type that has gone, or has another name, since.
             self.flush()
-            return None
+        except (EOFError, pickle.UnpicklingError):  # The power failed before the file was on the disk.
+            self.flush()
+        return None
+
+    def save_overload(self, sig: Any, data: Any) -> None:
+        with suppress(OSError):  # Where the disk is full, the next run compiles it once more.
+            super().save_overload(sig, data)
 
 
 def keep(kernel: Dispatcher[Any]) -> None:

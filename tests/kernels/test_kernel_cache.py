@@ -28,6 +28,18 @@ _, first, _ = connected_pixels(np.zeros((2, 2), np.int32))
 print(len(kernels) > 15, kernel_cache.FOLDER, *first, connected_pixels.stats.cache_path)
 """
 
+ONE_KERNEL = """
+import numpy as np
+from gsseg_core.learn.em.rejected_regions import connected_pixels
+print(connected_pixels(np.zeros((2, 2), np.int32))[1].tolist(), sum(connected_pixels.stats.cache_hits.values()))
+"""
+FULL_DISK = """
+import errno, os
+def full(*_):
+    raise OSError(errno.ENOSPC, "No space left on device")
+os.replace = full
+"""
+
 
 @pytest.fixture
 def nowhere(tmp_path: Path) -> dict[str, str]:
@@ -54,6 +66,23 @@ def test_every_kernel_loads_and_runs_where_none_can_be_kept(nowhere: dict[str, s
     done = run({**nowhere, "NUMBA_CACHE_DIR": str(tmp_path / "cache")}, "-c", EVERY_KERNEL)
     assert done.stdout.startswith(f"True {tmp_path}/cache 0 {tmp_path}/cache/"), done.stderr
     assert list((tmp_path / "cache").rglob("*.nbi"))
+
+
+def test_a_kernel_that_is_not_whole_on_the_disk_is_compiled_anew_and_kept(tmp_path: Path) -> None:
+    environment = {**os.environ, "NUMBA_CACHE_DIR": str(tmp_path)}
+    assert run(environment, "-c", ONE_KERNEL).stdout == "[0] 0\n"
+    for suffix in ("nbi", "nbc"):  # as a power failure leaves files that were written just before
+        (kept,) = tmp_path.rglob(f"kernel.*connected_pixels*.{suffix}")
+        for content in (b"", kept.read_bytes()[:100], bytes(kept.stat().st_size)):
+            kept.write_bytes(content)
+            done = run(environment, "-c", ONE_KERNEL)
+            assert done.stdout == "[0] 0\n", done.stderr
+    assert run(environment, "-c", ONE_KERNEL).stdout == "[0] 1\n"
+
+
+def test_a_disk_too_full_to_keep_a_kernel_does_not_end_the_run(tmp_path: Path) -> None:
+    done = run({**os.environ, "NUMBA_CACHE_DIR": str(tmp_path)}, "-c", FULL_DISK + ONE_KERNEL)
+    assert done.stdout == "[0] 0\n", done.stderr
 
 
 def test_only_trying_tells_whether_a_folder_can_be_written_to(tmp_path: Path) -> None:
