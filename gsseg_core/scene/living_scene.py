@@ -22,7 +22,7 @@ from gsseg_core.files.json_files import whole_number
 from gsseg_core.files.npz_files import NpzArrays
 from gsseg_core.scene.gaussian_scene import ACTIVATED, GaussianScene
 from gsseg_core.scene.group_frames import IDENTITY, is_identity, joined, moved_geometry, moved_scene, relation
-from gsseg_core.scene.scene_delta import MAX_ID, SceneDelta, read_similarity, similarity_entry
+from gsseg_core.scene.scene_delta import MAX_ID, SceneDelta, read_similarity, similarity_entry, straightened
 from gsseg_core.scene.scene_ids import with_ids
 from gsseg_core.scene.similarity import Similarity
 from gsseg_core.scene.vertices import MEANS, OPACITY, QUATS, SCALES, columns, pack_vertices
@@ -187,7 +187,7 @@ class LivingScene:
             if move.group not in frames:
                 raise SceneDeltaError(f"scene delta: moves group {move.group}, which holds no Gaussian; expected one "
                                       f"of {len(frames)} groups")  # fmt: skip
-            frames[move.group] = move.motion.after(frames[move.group])
+            frames[move.group] = straightened(move.motion.after(frames[move.group]))
         ids = np.concatenate([self.ids[stays], delta.added_ids])
         groups = np.concatenate([self.groups[stays], delta.added_groups])
         local = joined(self.local, stays, delta.added, ids)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -171,11 +171,24 @@ def check_similarity(motion: Similarity, who: str) -> None:
             f"{who} holds NaN, too large numbers or a scale of {motion.scale:g}; expected a scale above 0, and numbers "
             f"of at most {LIMITS.max_value:g} (limit max_value)"
         )
-    off = np.abs(motion.rotation @ motion.rotation.T - np.eye(3)).max()
+    off = _off(motion.rotation)
     if off > _ORTHONORMAL or np.linalg.det(motion.rotation) < 0:
         raise SceneDeltaError(
             f"{who} is no rotation (off by {off:.3g}); expected an orthonormal matrix of determinant 1"
         )
+
+
+def straightened(frame: Similarity) -> Similarity:
+    """Give a frame the nearest rotation, before roundings of many motions add up to what no file may hold."""
+    if _off(frame.rotation) <= _ORTHONORMAL / 2:
+        return frame
+    left, _, right = np.linalg.svd(frame.rotation)
+    return replace(frame, rotation=left @ right)
+
+
+def _off(rotation: npt.NDArray[np.float64]) -> float:  # (3, 3)
+    """By how much a matrix is no rotation."""
+    return float(np.abs(rotation @ rotation.T - np.eye(3)).max())
 
 
 def similarity_entry(frame: Similarity) -> dict[str, Any]:

@@ -15,7 +15,7 @@ from small_scenes import balls_on_a_table
 from gsseg_core.errors import GssegError, SceneDeltaError, SceneValueError
 from gsseg_core.scene.gaussian_scene import GaussianScene
 from gsseg_core.scene.living_scene import LivingScene
-from gsseg_core.scene.scene_delta import GroupMove, SceneDelta
+from gsseg_core.scene.scene_delta import GroupMove, SceneDelta, read_similarity
 from gsseg_core.scene.similarity import Similarity
 
 SCENE, _ = balls_on_a_table()
@@ -135,6 +135,16 @@ def test_what_is_added_with_fewer_bands_of_sh_than_the_scene_keeps_its_colours()
     np.testing.assert_array_equal(after.scene.sh[:-20], scene.sh)
     np.testing.assert_array_equal(after.scene.sh[-20:, :4], sh)
     assert not after.scene.sh[-20:, 4:].any()
+
+
+def test_a_frame_can_be_saved_and_read_however_many_rounded_motions_made_it() -> None:
+    living = LivingScene.of(SCENE)
+    rounded = Rotation.from_rotvec([0.1, 0.2, 0.3]).as_matrix() * (1 + 4e-7)  # as far off as one motion may be
+    for _ in range(30):
+        living, _ = living.apply(SceneDelta(moves=(GroupMove(0, Similarity(rotation=rounded)),)))
+    (entry,) = living.frame_entries()
+    expected = Rotation.from_rotvec([3, 6, 9]).as_matrix()
+    np.testing.assert_allclose(read_similarity(entry).rotation, expected, atol=1e-5)
 
 
 @pytest.mark.parametrize("revision", ["a", 1.5])
