@@ -122,7 +122,9 @@ class Lens:
         x, y, z = rays[..., 0], rays[..., 1], rays[..., 2]
         if self.model.projection is Projection.PANORAMA:
             turn, fall = np.arctan2(x, z), np.arctan2(y, np.hypot(x, z))
-            return np.stack([(turn / (2 * np.pi) + 0.5) * self.width, (fall / np.pi + 0.5) * self.height], axis=-1)
+            # What lies exactly behind is on both edges, and what lies exactly below on the last one: both in the image.
+            column, row = (turn / (2 * np.pi) + 0.5) % 1 * self.width, (fall / np.pi + 0.5) * self.height
+            return np.stack([column, np.minimum(row, np.nextafter(float(self.height), 0))], axis=-1)
         across = np.hypot(x, y)
         angle = np.arctan2(across, z)
         with np.errstate(all="ignore"):

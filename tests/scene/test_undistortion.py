@@ -52,6 +52,13 @@ def test_a_view_of_a_fisheye_that_sees_behind_itself_ends_at_120_degrees() -> No
     assert (view.width, view.height) == (2 * 173, 2 * 173)  # 100 tan(60 degrees)
 
 
+@pytest.mark.parametrize("width", [64, 66, 1920])  # Of all but the first, faces have a pixel in their very middle.
+def test_no_pixel_of_a_panoramas_faces_is_outside_of_it(width: int) -> None:
+    image = np.zeros((width // 2, width), np.int32)
+    for view in undistortions(Lens(MODELS_BY_NAME["EQUIRECTANGULAR"], width, width // 2)):
+        assert not (view.sample(image, OUTSIDE) == OUTSIDE).any(), view.face
+
+
 def test_the_six_faces_of_a_panorama_show_every_direction_once() -> None:
     views = undistortions(Lens(MODELS_BY_NAME["EQUIRECTANGULAR"], 400, 200))
     assert [view.face for view in views] == ["front", "right", "back", "left", "up", "down"]
