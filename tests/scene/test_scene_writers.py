@@ -6,6 +6,7 @@ import json
 import struct
 import subprocess
 import sys
+import time
 import zipfile
 from collections.abc import Callable
 from pathlib import Path
@@ -261,6 +262,17 @@ def test_a_full_disk_is_one_error_and_the_earlier_file_stays_whole(tmp_path: Pat
     assert done.stdout.splitlines() == [f"{name} WriteError True" for name in SCENE_WRITERS]
     assert set((tmp_path / "out").iterdir()) == before
     assert all(path.read_text() == "as it was" for path in before)
+
+
+@pytest.mark.parametrize("name", SCENE_WRITERS)
+def test_a_machine_whose_clock_begins_in_1970_writes_every_format(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, name: str
+) -> None:
+    then = time.gmtime(100)
+    monkeypatch.setattr(time, "localtime", lambda *_: then)
+    path = tmp_path / f"scene{SCENE_WRITERS[name].suffixes[0]}"
+    write_scene(some_scene(30), path)
+    assert path.stat().st_size > 0
 
 
 def test_a_palette_of_harmonics_stands_for_more_gaussians_than_it_has_entries(

@@ -61,11 +61,12 @@ def write_sog(path: Path, scene: GaussianScene, run: str | None) -> None:
         meta["shN"] = {"count": len(palette), "bands": scene.sh_degree, "codebook": book,
                        "files": ["shN_centroids.webp", "shN_labels.webp"]}  # fmt: skip
     with zipfile.ZipFile(path, "w") as archive:
-        archive.writestr("meta.json", json.dumps(meta))
+        # By a name alone, zipfile takes the time of now, which on a machine without a clock is too early for it.
+        archive.writestr(zipfile.ZipInfo("meta.json"), json.dumps(meta))
         for name, image in images.items():
             content = io.BytesIO()
             Image.fromarray(image).save(content, "WEBP", lossless=True, exact=True, quality=50, method=2)
-            archive.writestr(name, content.getvalue())
+            archive.writestr(zipfile.ZipInfo(name), content.getvalue())
 
 
 def _pixels(values: npt.NDArray[Any]) -> npt.NDArray[np.uint8]:  # (N, C), whole numbers below 256
