@@ -8,6 +8,7 @@ import numpy as np
 import numpy.typing as npt
 
 from gsseg_core.errors import SceneFileError
+from gsseg_core.files.input_files import DAMAGED, reason
 from gsseg_core.scene.ply import read_elements
 from gsseg_core.scene.quaternions import from_smallest_three
 from gsseg_core.scene.vertices import REST_COUNTS, ReadScene, dc_of, logits, pack_in_blocks, pack_vertices, rest_names
@@ -42,8 +43,8 @@ def read_compressed_ply(path: Path, within: Path | None = None) -> ReadScene:
 
     try:
         packed = pack_in_blocks(n, pack)
-    except (ValueError, TypeError) as error:
-        raise SceneFileError(f"{path}: not a compressed PLY ({error}); expected one of PlayCanvas") from error
+    except DAMAGED as error:
+        raise SceneFileError(f"{path}: not a compressed PLY ({reason(error)}); expected one of PlayCanvas") from error
     return ReadScene(packed)
 
 

@@ -324,6 +324,7 @@ def test_a_ksplat_whose_counts_do_not_fit_is_refused(tmp_path: Path, place: int,
         (b"property uint packed_scale", b"property uint packed_skale", "lacks elements or properties"),
         (b"property float min_x", b"property float mix_x", "not a compressed PLY"),
         (b"property uchar f_rest_0\n", b"property char f_rest_0\n", "not a compressed PLY"),
+        (b"property uchar f_rest_3\n", b"property uchar f_west_3\n", "not a compressed PLY"),
     ],
 )
 def test_a_compressed_ply_whose_elements_do_not_fit_is_refused(
