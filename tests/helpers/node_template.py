@@ -25,8 +25,9 @@ from contextlib import suppress
 from pathlib import Path
 
 REPOSITORY = Path(__file__).parents[2]
-OWN = {"ROS_DOMAIN_ID", "ROS_LOG_DIR", "PYTEST_CURRENT_TEST"}
-"""Variables that nothing reads while it is imported: a node may have its own."""
+OWN = {"ROS_DOMAIN_ID", "ROS_LOG_DIR", "PYTEST_CURRENT_TEST", "TORCHINDUCTOR_CACHE_DIR"}
+"""Variables that nothing reads while it is imported: a node may have its own. PyTorch sets the last one itself, where
+any test of a worker learns with it, and PyTorch is not imported."""
 
 
 class Copy:
