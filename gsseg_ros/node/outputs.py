@@ -12,6 +12,7 @@ import numpy as np
 from gsseg_msgs.msg import ObjectArray, SegmentationReport
 from gsseg_msgs.srv import Segment
 from rclpy.duration import Duration
+from rclpy.event_handler import PublisherEventCallbacks
 from rclpy.impl.implementation_singleton import rclpy_implementation
 from rclpy.lifecycle import LifecycleNode
 from rclpy.publisher import Publisher
@@ -218,7 +219,12 @@ class Outputs:
 
     def _class(self, token: str) -> Publisher:
         if token not in self._classes:
-            self._classes[token] = self._node.create_publisher(PointCloud2, f"~/classes/{token}", latched())
+            # Latched topics go with every subscription but one with a deadline, whose own side says so. To be told here
+            # of that, the executor would look at each topic again with every callback, and there may be hundreds.
+            silent = PublisherEventCallbacks(use_default_callbacks=False)
+            self._classes[token] = self._node.create_publisher(
+                PointCloud2, f"~/classes/{token}", latched(), event_callbacks=silent
+            )
         return self._classes[token]
 
 

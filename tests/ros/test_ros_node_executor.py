@@ -8,11 +8,12 @@ from typing import Any
 import pytest
 from ros_fixtures import node_fixture, parameters_fixture, root_fixture  # noqa: F401
 from ros_helpers import PATIENCE, Ros, ros_fixture  # noqa: F401
-from ros_robot import RELIABLE
+from ros_robot import CLASSES, RELIABLE
 
 pytest.importorskip("gsseg_msgs.msg", reason="gsseg_msgs is not installed")
 
 from rcl_interfaces.srv import GetParameters
+from rclpy.lifecycle import TransitionCallbackReturn
 from rclpy.qos import QoSProfile, ReliabilityPolicy
 from sensor_msgs.msg import PointCloud2
 
@@ -57,3 +58,9 @@ def test_a_topic_that_goes_while_callbacks_are_waited_for_is_no_error(
     executor.spin_once(0.05)
     executor.shutdown()
     assert said == []
+
+
+def test_topics_of_classes_which_may_be_hundreds_are_nothing_that_the_executor_looks_at(node: SegmentNode) -> None:
+    assert node.trigger_configure() == TransitionCallbackReturn.SUCCESS
+    topics = [publisher for publisher in node.publishers if "/classes/" in publisher.topic_name]
+    assert len(topics) == len(CLASSES) and not any(publisher.event_handlers for publisher in topics)
