@@ -16,7 +16,7 @@ MEMORY_BUDGET = 2 << 30  # bytes of them where the system does not say how much 
 
 R = TypeVar("R")
 
-_KEEPING = threading.Lock()  # while a view or an answer is kept; not in each object, as those travel to workers
+_KEEPING = threading.Lock()  # while what is kept changes; not in each object, as those travel to workers
 
 
 def default_budget(device: str = "cpu") -> int:
@@ -82,10 +82,11 @@ class PreparedViews:
 
     def drop(self, name: str) -> None:
         """Keep nothing of a view."""
-        self.in_memory.pop(name, None)
-        self._sizes.pop(name, None)
-        self._file.drop(name)
-        self._answers.drop(name)
+        with _KEEPING:
+            self.in_memory.pop(name, None)
+            self._sizes.pop(name, None)
+            self._file.drop(name)
+            self._answers.drop(name)
 
     def clear(self) -> None:
         """Keep nothing."""
