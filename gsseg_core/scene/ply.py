@@ -92,6 +92,8 @@ def _read_header(file: BinaryIO) -> Any:
     file.seek(header.tell())
     left = os.fstat(file.fileno()).st_size - header.tell()
     for element in ply:
+        if element.count and not element.properties:  # However many there are, they take no bytes.
+            raise ValueError(f"element {quoted(element.name)} of {element.count:,} rows has no properties")
         if ply.text:
             least = 2 * len(element.properties) * element.count - 1  # a digit and what follows it
         else:

@@ -149,6 +149,14 @@ def test_a_count_beyond_the_file_is_refused_before_memory_is_taken(tmp_path: Pat
         tracemalloc.stop()
 
 
+@pytest.mark.parametrize("encoding", ENCODINGS)
+def test_rows_without_properties_are_refused_and_not_counted_one_by_one(tmp_path: Path, encoding: str) -> None:
+    path = write_ply(tmp_path / "a.ply", some_vertices(), encoding)
+    path.write_bytes(path.read_bytes().replace(b"element", b"element empty 1000000000000\nelement", 1))
+    with pytest.raises(SceneFileError, match="element 'empty' of 1,000,000,000,000 rows has no properties"):
+        read_vertices(path)
+
+
 @pytest.mark.parametrize(
     ("content", "found"),
     [(b"", "is empty"), (b"version https://git-lfs.github.com/spec/v1\n", "begins with b'version https://git-lfs.'")],
