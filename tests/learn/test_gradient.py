@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import sys
+
 import numpy as np
 import pytest
 import torch
@@ -10,7 +12,7 @@ from small_scenes import NUM_CLASSES, balls_on_a_table, clean_views, taught
 
 from gsseg_core.data.view import View
 from gsseg_core.errors import SettingsError
-from gsseg_core.learn.gradient_learner import GradientLearner, GradientSettings, cross_entropy
+from gsseg_core.learn.gradient_learner import GradientLearner, GradientSettings, _Adam, cross_entropy
 from gsseg_core.raster.backends import make_operator
 
 SCENE, TRUTH = balls_on_a_table()
@@ -55,6 +57,23 @@ def test_the_gradient_is_that_of_finite_differences() -> None:
         assert float(rise) == pytest.approx(expected, rel=0.02, abs=2e-6)
     unseen = np.setdiff1d(np.arange(len(SCENE)), observation.ids)
     assert not codes.grad[unseen].any()
+
+
+def test_steps_are_those_of_adam() -> None:
+    rng = np.random.default_rng(0)
+    codes = torch.from_numpy(rng.normal(size=(7, 3)).astype(np.float32))
+    adam, expected, mean, square = _Adam(codes), codes.numpy().astype(np.float64), 0.0, 0.0
+    for step in range(1, 50):
+        gradient, rate = rng.normal(size=(7, 3)), 0.05 * 0.9**step
+        adam.step(torch.from_numpy(gradient.astype(np.float32)), rate)
+        mean, square = 0.9 * mean + 0.1 * gradient, 0.999 * square + 0.001 * gradient**2
+        expected -= rate * (mean / (1 - 0.9**step)) / (np.sqrt(square / (1 - 0.999**step)) + 1e-8)
+    np.testing.assert_allclose(codes.numpy(), expected, atol=1e-6)
+
+
+def test_it_does_without_the_compiler_of_pytorch_which_takes_seconds_to_load(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "torch._dynamo", None)
+    taught(GradientLearner(balls_on_a_table()[0], NUM_CLASSES, GradientSettings(epochs=1)), clean_views(1)).fit()
 
 
 def test_the_loss_falls_from_epoch_to_epoch() -> None:
