@@ -6,6 +6,7 @@ import errno
 import os
 import stat
 import struct
+import sys
 import tokenize
 import warnings
 import zipfile
@@ -36,9 +37,12 @@ _KINDS = {
     stat.S_IFDIR: "a folder", stat.S_IFIFO: "a named pipe", stat.S_IFSOCK: "a socket",
     stat.S_IFCHR: "a device", stat.S_IFBLK: "a device",
 }  # fmt: skip
+_UNPACKERS = (("lzma", "LZMAError"), ("compression.zstd", "ZstdError"))
 DAMAGED = (
     OSError, SyntaxError, ValueError, TypeError, AttributeError, LookupError, ArithmeticError, EOFError,
     RuntimeError, struct.error, zlib.error, zipfile.BadZipFile, tokenize.TokenError, Image.DecompressionBombError,
+    # Of what zipfile has loaded to unpack with: not every Python has them.
+    *(getattr(sys.modules.get(name), error, zlib.error) for name, error in _UNPACKERS),
 )  # fmt: skip
 """What Pillow, NumPy, zipfile and zlib raise on damaged bytes; RuntimeError where a flipped bit says "encrypted".
 

@@ -375,6 +375,17 @@ def test_raw_bytes_and_bombs_in_place_of_a_soft_mask_are_refused(tmp_path: Path)
     assert_refused_in_little_memory(view.read_seen, MaskSizeError, "2048 x 2048 pixels")
 
 
+@pytest.mark.parametrize("method", [zipfile.ZIP_DEFLATED, zipfile.ZIP_BZIP2, zipfile.ZIP_LZMA])
+def test_damage_is_one_error_whatever_a_file_is_packed_with(tmp_path: Path, method: int) -> None:
+    path = tmp_path / "state.npz"
+    with zipfile.ZipFile(path, "w", method) as archive:
+        archive.writestr("header.npy", bytes(1000))
+    content = path.read_bytes()
+    path.write_bytes(content[:45] + b"\xff" * 15 + content[60:])
+    with pytest.raises(StateFileError, match=r"state\.npz: is not a saved state, or is damaged"):
+        State.load_alone(path)
+
+
 def test_a_sparse_array_takes_less_room_than_numpy_would_give_it(tmp_path: Path) -> None:
     rng = np.random.default_rng(0)
     dense = np.where(rng.random((3_000, 40)) < 0.1, rng.random((3_000, 40)), 0).astype(np.float32)
