@@ -56,6 +56,8 @@ def _load(path: str) -> Any:
         raise UnfitError(
             "holds objects that only executing the file would make; expected tensors alone (torch.load, weights_only)"
         ) from error
+    except AssertionError as error:  # So PyTorch says what it expects of what is pickled.
+        raise ValueError(str(error)) from error
 
 
 def _find(content: object) -> tuple[Mapping[str, Any], dict[str, str]]:

@@ -215,6 +215,15 @@ def test_a_checkpoint_is_never_executed(tmp_path: Path) -> None:
     refuse(tmp_path / "b.pt", r"b\.pt: truncated or not a checkpoint of gsplat")
 
 
+def test_a_checkpoint_whose_tensors_lie_nowhere_is_refused(tmp_path: Path) -> None:
+    torch.save({"splats": torch.zeros(1)}, tmp_path / "a.pt")
+    with zipfile.ZipFile(tmp_path / "a.pt") as before, zipfile.ZipFile(tmp_path / "b.pt", "w") as after:
+        for name in before.namelist():
+            # In place of a dictionary, what is stored outside under the number 1.
+            after.writestr(name, b"\x80\x02K\x01Q." if name.endswith("data.pkl") else before.read(name))
+    refuse(tmp_path / "b.pt", r"b\.pt: truncated or not a checkpoint of gsplat")
+
+
 def test_a_checkpoint_that_becomes_larger_than_its_file_is_refused(tmp_path: Path) -> None:
     splats = scene_files.stored(some_scene(4, 0))
     splats["means"] = torch.zeros(1, 3).expand(10**9, 3)
