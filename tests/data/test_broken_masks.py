@@ -275,6 +275,12 @@ def test_a_list_of_automatic_masks_that_names_others_is_refused(tmp_path: Path, 
     refused(tmp_path, place, said)
 
 
+def test_a_name_of_eiseg_with_a_million_spaces_is_read_in_the_time_of_its_length(tmp_path: Path) -> None:
+    place = tmp_path / written(tmp_path, WRITERS["EISeg images"])
+    (place / "autosave_label.txt").write_text(f" 1 red{' ' * 10**6}box 255 0 0 \n")
+    assert Dataset(tmp_path, place).class_names[1] == "red box"
+
+
 def test_a_mask_of_labelme_that_inflates_is_refused_before_it_does(tmp_path: Path) -> None:
     import base64
     import struct

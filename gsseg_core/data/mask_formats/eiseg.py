@@ -58,7 +58,7 @@ def _listed(place: Place) -> dict[int, str]:
     path, names = place.path / _LABELS, {}
     if path.is_file():
         for line in place.text(path).splitlines():
-            found = re.fullmatch(r"\s*([0-9]{1,5})\s+(.*?)(?:\s+[0-9]+){0,3}\s*", line)
+            found = re.fullmatch(r"([0-9]{1,5}) (.*?)(?: [0-9]+){0,3}", " ".join(line.split()))
             if line.strip() and found is None:
                 raise MaskFormatError(f"{path}: has the line {quoted(line[:60])}; expected an id, a name and a colour")
             if found is not None:
