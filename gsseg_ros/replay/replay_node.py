@@ -274,16 +274,17 @@ def main(args: list[str] | None = None) -> int:
     """Run the node; exit code 0 when done or stopped by a signal, 2 for bad input."""
     search_no_imports_at_the_end()
     make_room()
-    try:
-        # rclpy's own handlers would take the context away in the middle of a publication.
-        rclpy.init(args=_with_parameters(args), signal_handler_options=SignalHandlerOptions.NO)
-    except Exception as error:  # arguments that ROS cannot parse; its class for that is not public
-        print(f"replay_node: {' '.join(str(error).split())}", file=sys.stderr)
-        return 2
     early: list[int] = []  # signals that come while the node is made
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, lambda which, _: early.append(which))
-    node = ReplayNode()
+    try:
+        # rclpy's own handlers would take the context away in the middle of a publication.
+        rclpy.init(args=_with_parameters(args), signal_handler_options=SignalHandlerOptions.NO)
+        node = ReplayNode()
+    except Exception as error:  # What ROS raises for arguments and parameters that it cannot take is not public.
+        print(f"replay_node: {' '.join(str(error).split())}", file=sys.stderr)
+        rclpy.try_shutdown()
+        return 2
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, lambda *_: node.stop())
     if early:

@@ -321,8 +321,9 @@ def test_the_option_grow_is_the_parameter() -> None:
     assert _with_parameters([*remapped[:1], "--grow", *remapped[1:]]) == [*remapped, "--ros-args", "-p", "grow:=true"]
 
 
-def test_arguments_that_ros_cannot_parse_are_refused_without_a_traceback(ros: Ros) -> None:
-    process = ros.start("replay_node", None, "-p", "rate")
+@pytest.mark.parametrize("parameter", ["rate", "use_sim_time:=5"])
+def test_arguments_that_ros_cannot_take_are_refused_without_a_traceback(ros: Ros, parameter: str) -> None:
+    process = ros.start("replay_node", None, "-p", parameter)
     assert process.wait() == 2 and "Traceback" not in process.output, process.output
 
 
