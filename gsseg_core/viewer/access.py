@@ -17,7 +17,7 @@ import socket
 import threading
 from collections.abc import Callable, Sequence
 from typing import Any
-from urllib.parse import parse_qs, urlsplit
+from urllib.parse import parse_qs
 
 from gsseg_core.errors import SettingsError
 from gsseg_core.text import printable
@@ -88,7 +88,7 @@ class Listener:
             "Referrer-Policy": "no-referrer",
             "X-Content-Type-Options": "nosniff",
         }
-        if self.token and _is(self.token, parse_qs(urlsplit(path).query).get("token", [])):
+        if self.token and _is(self.token, _tokens(path)):
             # The page's websocket has another address, without the query.
             sent["Set-Cookie"] = f"{self._cookie}={self.token}; Path=/; HttpOnly; SameSite=Strict"
         return sent
@@ -114,7 +114,7 @@ class Listener:
 
     def _shows_token(self, path: str, values: HeaderValues) -> bool:
         assert self.token is not None
-        shown = parse_qs(urlsplit(path).query).get("token", [])
+        shown = _tokens(path)
         for cookie in ";".join(values("Cookie")).split(";"):
             name, _, value = cookie.strip().partition("=")
             if name == self._cookie:
@@ -168,6 +168,11 @@ def _resolved(host: str) -> tuple[int, tuple[Any, ...]]:
         )
     family, _, _, _, place = answer[0]
     return family, place
+
+
+def _tokens(path: str) -> list[str]:
+    """Find what the query of a path, which may be any text, gives for tokens."""
+    return parse_qs(path.partition("?")[2]).get("token", [])
 
 
 def _only(values: Sequence[str]) -> str | None:

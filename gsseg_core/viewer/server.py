@@ -9,6 +9,7 @@ from __future__ import annotations
 import contextlib
 import inspect
 import io
+import logging
 import math
 import threading
 import warnings
@@ -21,6 +22,7 @@ import viser
 import websockets.asyncio.server
 from viser import _messages
 from websockets.asyncio.server import ServerConnection
+from websockets.exceptions import ConnectionClosed, InvalidHandshake
 from websockets.http11 import Request, Response
 from websockets.typing import Data
 
@@ -34,6 +36,16 @@ _LARGEST_NUMBER, _LONGEST_TEXT = 1e9, 1000
 
 _HEARD = ("ViewerCameraMessage", "ScenePointerMessage", "GuiUpdateMessage", "GetRenderResponseMessage")
 """What a page sends that the viewer has a use for. viser itself would also take files, and open itself to everybody."""
+
+
+def _tells_more(record: logging.LogRecord) -> bool:
+    """Whether it says more than that somebody connected who is no browser, or left at once, as browsers do, too."""
+    harmless = InvalidHandshake, ConnectionClosed, ConnectionError
+    return not (record.exc_info and isinstance(record.exc_info[1], harmless))
+
+
+_log = logging.getLogger(__name__)  # of the package `websockets`, which has a traceback for each of these
+_log.addFilter(_tells_more)
 
 
 def start_server(listener: Listener) -> viser.ViserServer:
@@ -74,7 +86,7 @@ def _guarding(listener: Listener) -> Iterator[threading.Event]:
 
         guarded.set()
         ours = {"sock": listener.socket, "create_connection": _Connection, "max_size": MOST_BYTES}
-        ours |= {"open_timeout": PATIENCE, "ping_timeout": PATIENCE}
+        ours |= {"open_timeout": PATIENCE, "ping_timeout": PATIENCE, "logger": _log}
         return real(handler, process_request=process, **{**options, **ours})
 
     websockets.asyncio.server.serve = serve  # type: ignore[assignment, misc]

@@ -6,7 +6,7 @@ import errno
 import socket
 import threading
 from collections.abc import Callable, Sequence
-from contextlib import closing
+from contextlib import closing, suppress
 
 import pytest
 from patience import PATIENCE
@@ -79,7 +79,14 @@ def test_where_others_can_connect_a_token_is_asked_for_that_the_address_holds() 
         right, host = f"/?token={listener.token}", socket.gethostname()
         for name in ("localhost:1", "192.168.1.7:8080", "[fe80::1]", host, f"{host.partition('.')[0]}.local"):
             assert listener.refusal(right, values(Host=name)) is None
-            for path in ("/", "/?token=", "/?token=wrong", f"/?other={listener.token}", "/?token=\u00e4"):
+            for path in (
+                "/",
+                "/?token=",
+                "/?token=wrong",
+                f"/?other={listener.token}",
+                "/?token=\u00e4",
+                "//[x?token=wrong",
+            ):
                 assert "The token is missing or wrong" in str(listener.refusal(path, values(Host=name)))
         assert listener.refusal(right, values(Host="evil.example:8080"))
         assert listener.refusal(right, values(Host="localhost:1", Origin="http://evil.example"))
@@ -156,3 +163,22 @@ def test_addresses_of_version_6_are_written_as_browsers_want_them() -> None:
     with closing(Listener(opened, "::1")) as listener:
         assert listener.url == f"http://[::1]:{listener.port}" and listener.token is None
         assert listener.refusal("/", values(Host=f"[::1]:{listener.port}")) is None
+
+
+@pytest.mark.parametrize("host", ["127.0.0.1", "0.0.0.0"])
+def test_who_connects_and_is_no_browser_is_no_word_in_the_log(host: str, caplog: pytest.LogCaptureFixture) -> None:
+    pytest.importorskip("viser")
+    from gsseg_core.viewer.server import start_server
+
+    page = b"GET //[x HTTP/1.1\r\nHost: localhost\r\n\r\n"
+    with closing(listen(host, PORT)) as listener:
+        server = start_server(listener)
+        for said in (b"", b"\x16\x03\x01", b"POST / HTTP/1.1\r\nHost: localhost\r\n\r\n", page, bytes(20_000)):
+            with socket.create_connection(("127.0.0.1", listener.port), timeout=PATIENCE) as client:
+                client.sendall(said)
+                client.shutdown(socket.SHUT_WR)
+                with suppress(ConnectionResetError):
+                    while client.recv(1 << 16):
+                        pass
+        server.stop()
+    assert not caplog.records
