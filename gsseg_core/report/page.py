@@ -19,7 +19,7 @@ from gsseg_core.report import sections
 from gsseg_core.report.findings import warnings_of
 from gsseg_core.report.sections import PageInputs
 from gsseg_core.several_at_once import several_at_once
-from gsseg_core.text import percent, printable
+from gsseg_core.text import counted, percent, printable
 
 if TYPE_CHECKING:
     from jinja2 import Environment
@@ -95,7 +95,7 @@ def environment() -> Environment:
         lstrip_blocks=True,
         keep_trailing_newline=True,
     )
-    made.filters.update(percent=percent, thousands="{:,}".format)
+    made.filters.update(counted=counted, percent=percent, thousands="{:,}".format)
     made.policies["json.dumps_kwargs"] = {"separators": (",", ":"), "allow_nan": False}
     return made
 

@@ -13,6 +13,7 @@ import viser
 from gsseg_core.data.view import View
 from gsseg_core.errors import SettingsError, explained
 from gsseg_core.scene.camera import Camera
+from gsseg_core.text import counted
 from gsseg_core.viewer.access import Listener, listen
 from gsseg_core.viewer.clients import AUTO, DRAWN_BY, ClientRenderers
 from gsseg_core.viewer.live_source import LiveSource
@@ -121,7 +122,7 @@ class Viewer:
                 update = source.wait(0.5)
                 if update is not None:
                     self.state.replace(update.labelling)
-                    self.panel.show_live(f"{update.num_views} views so far")
+                    self.panel.show_live(f"{counted(update.num_views, 'view')} so far")
             except Exception as error:
                 if (what := explained(error)) is None:
                     raise

@@ -173,3 +173,13 @@ def test_any_name_stays_text_in_elements_in_attributes_and_in_json(name: str) ->
     assert "".join(page.said) == printable(name)
     embedded = text.partition("<script>")[2].removesuffix("</script>")
     assert "<" not in embedded and json.loads(embedded) == {"name": name}
+
+
+def test_one_view_is_not_called_views() -> None:
+    sections = environment().get_template("sections.html.j2").module
+    view = {"name": "a", "reliability": 1.0, "rejected_share": None, "confusions": []}
+    for others, told in (([view], "The other 1 view<"), ([view] * 2, "The other 2 views<")):
+        assert told in str(sections.reliability({"worst": [view], "others": others, "trusted": 0.7}))  # type: ignore[attr-defined]
+        assert f"over {told[10:-1]}." in str(
+            sections.classes({"classes": [], "many": 1, "num_views": len(others), "held_out": True})  # type: ignore[attr-defined]
+        )

@@ -127,7 +127,7 @@ def test_a_source_is_asked_again_after_a_gpu_had_no_memory() -> None:
                 asked.set()
                 starved_gpu()
             time.sleep(0.02)
-            return LiveUpdate(labelled(TRUTH.astype(np.int32), np.eye(4, dtype=np.float32)[TRUTH], dict(NAMES)), 7)
+            return LiveUpdate(labelled(TRUTH.astype(np.int32), np.eye(4, dtype=np.float32)[TRUTH], dict(NAMES)), 1)
 
         def close(self) -> None:
             pass
@@ -135,4 +135,4 @@ def test_a_source_is_asked_again_after_a_gpu_had_no_memory() -> None:
     unknown = ViewModel(SCENE, Labelling.unknown(len(SCENE)))
     with closing(Viewer(unknown, source=Source(), listener=listen(port=18520), draw=SERVER)) as viewer:
         assert viewer.panel._live is not None
-        wait_until(lambda: "7 views so far" in viewer.panel._live.content, "what the source has")  # type: ignore[union-attr]
+        wait_until(lambda: "1 view so far" in viewer.panel._live.content, "what the source has")  # type: ignore[union-attr]
