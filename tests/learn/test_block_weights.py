@@ -6,8 +6,12 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from small_scenes import look_at
 
+from gsseg_core.data.view import View
 from gsseg_core.learn.em.block_weights import FAR, NEAR, STEP, block_weights
+from gsseg_core.learn.em.em_learner import EMLearner
+from gsseg_core.scene.gaussian_scene import GaussianScene
 
 
 @settings(max_examples=50, deadline=None)
@@ -46,3 +50,15 @@ def test_blocks_follow_from_where_boundaries_are_whatever_the_labels_are_called_
     assert (sum(of_views) > 0).all()
     for mask, weights in zip(masks, of_views, strict=True):
         np.testing.assert_array_equal(block_weights(7 - mask, 7 - mask), weights)
+
+
+@pytest.mark.parametrize("column", [6, 10])
+def test_a_gaussian_by_itself_that_only_blocks_left_out_see_keeps_its_votes(column: int) -> None:
+    camera = look_at("view", np.array([0.0, 0.0, 3.0]), 16, 16, 30.0)
+    at = np.linalg.inv(camera.world_to_camera) @ [*(3 / 30 * (np.array([column, 6]) + 0.5 - 8)), 3, 1]
+    scene = GaussianScene.from_arrays(
+        at[None, :3], np.eye(4)[:1], np.full((1, 3), 1e-4), np.ones(1), np.zeros((1, 1, 3))
+    )
+    learner = EMLearner(scene, 2)
+    assert learner.observe(View.from_arrays(camera, np.ones((16, 16), np.int32)))
+    assert learner.fit().observed_.all() and learner.codes_.tolist() == [[0, 1]]

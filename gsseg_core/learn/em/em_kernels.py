@@ -124,16 +124,18 @@ def accumulate(gradient: CSRRows, pairs: ViewPairs, likelihood: np.ndarray, shar
 
 @kernel(parallel=True)
 def m_step(codes: CSRRows, gradient: np.ndarray, prior: np.ndarray) -> None:
-    """M-step: set the codes to normalise(codes * gradient + prior), in place; rows of zeros stay zero."""
+    """M-step: set the codes to normalise(codes * gradient + prior), in place; where that is zero, a row stays as it is.
+
+    So a Gaussian without a prior that only blocks left out see keeps what the votes say.
+    """
     indptr, _, data = codes
     for i in nb.prange(indptr.shape[0] - 1):
         total = np.float32(0.0)
         for z in range(indptr[i], indptr[i + 1]):
-            data[z] = data[z] * (np.float32(gradient[z]) * _GRADIENT_UNIT) + prior[z]
-            total += data[z]
+            total += data[z] * (np.float32(gradient[z]) * _GRADIENT_UNIT) + prior[z]
         if total > 0:
             for z in range(indptr[i], indptr[i + 1]):
-                data[z] /= total
+                data[z] = (data[z] * (np.float32(gradient[z]) * _GRADIENT_UNIT) + prior[z]) / total
 
 
 @kernel(parallel=True)
