@@ -47,7 +47,8 @@ class PerViewSession(LiveSession):
         return {k: object_name(k) for k in range(self._live.num_classes)}
 
     def _fuse(self, view: View, operator: ViewOperator | None = None) -> Rejection | None:
-        undo = self._table.checkpoint()
+        # The table looks at the mask again, and names of classes say nothing of its ids.
+        view, undo = replace(view, class_names=None).held(), self._table.checkpoint()
         if view.has_mask:  # Made once: its segments are lifted, and then the objects that they are.
             operator = operator or make_operator(self.scene, view.camera, self.device)
         try:

@@ -21,7 +21,7 @@ from small_scenes import (
 from gsseg_core.cli.main import main
 from gsseg_core.csr_rows import CSRRows
 from gsseg_core.data.dataset import Dataset
-from gsseg_core.data.label_images import UNKNOWN
+from gsseg_core.data.label_images import UNKNOWN, write_mask
 from gsseg_core.data.view import View
 from gsseg_core.errors import SettingsError, StateFileError, UnknownLabelError
 from gsseg_core.learn.em.em_learner import EMLearner
@@ -330,6 +330,19 @@ def test_a_view_that_was_set_aside_is_saved_and_loaded_and_comes_back(tmp_path: 
         assert each.move_view(name, lambda camera: VIEWS[1].camera, each.era)
         assert each.view_names == [view.name for view in VIEWS[:4]] and each.num_fused == 4
         np.testing.assert_array_equal(each.codes(), before)
+
+
+def test_masks_are_kept_as_they_were_fused_whatever_becomes_of_their_files(tmp_path: Path) -> None:
+    session, other = PerViewSession(SCENE), PerViewSession(SCENE)
+    for view in [in_halves(VIEWS[0], 1), *VIEWS[1:4]]:
+        path = tmp_path / f"{view.name}.png"
+        write_mask(path, view.read_labels(), 8)
+        assert session.fuse(View(view.camera, path)) is None and other.fuse(view) is None
+        path.unlink()
+    for each in (session, other):
+        assert each.repair().changed
+        assert each.move_view(VIEWS[1].name, lambda camera: VIEWS[1].camera, each.era)
+    np.testing.assert_array_equal(session.codes(), other.codes())
 
 
 def test_a_result_can_be_cut_at_a_level_and_the_tree_grows_with_the_views() -> None:
