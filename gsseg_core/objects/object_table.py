@@ -194,10 +194,10 @@ class ObjectTable:
         self.views[view.name] = view
 
     def forget(self, name: str) -> None:
-        """Drop a view; its evidence still counts for `match`, but no longer for `solve`. Raises as `remove` does."""
+        """Drop a view; its evidence still counts for `match`, not for `solve`. Raises as `relabelled` and `remove`."""
         self._require(name)
         if name in self._lifted:
-            self._forgotten.add(self._lifted[name], self._objects[name])
+            self._forgotten.add(self._lifted[name], self._numbers(name))
             del self._lifted[name], self._objects[name]
         del self.views[name]
 

@@ -71,7 +71,8 @@ def test_a_view_of_which_no_objects_are_known_has_none_or_is_refused() -> None:
     with pytest.raises(SettingsError, match="view 'nowhere' was not added; there are 1 others"):
         table.objects_in("nowhere")
     table.add(VIEWS[1])
-    for use in (lambda: table.objects_in(VIEWS[1].name), lambda: table.relabelled(VIEWS[1])):
+    name = VIEWS[1].name
+    for use in (lambda: table.objects_in(name), lambda: table.relabelled(VIEWS[1]), lambda: table.forget(name)):
         with pytest.raises(SettingsError, match=r"its objects are not known yet; expected solve\(\) first"):
             use()
 
