@@ -332,10 +332,10 @@ class Learner(ABC):
             if opened is not None:
                 opened.vote(total, sign=-1)
             raise
-        if opened is not None:
-            self._prepared.keep(view.name, opened)
         self.rejected.pop(view.name, None)
         self.views[view.name] = view
+        if opened is not None and not self._prepared.keep(view.name, opened):
+            self.views[view.name] = view.held()  # Else nothing tells which votes are its own, as with no budget.
         return True
 
     def _of_each(

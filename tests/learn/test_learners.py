@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import replace
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -16,7 +15,7 @@ from operator_cases import lifting
 from small_scenes import NAMES, NUM_CLASSES, OUT_OF_SIGHT, balls_on_a_table, clean_views, look_at, mean_iou, taught
 
 from gsseg_core.data.label_evidence import VOTE_UNIT
-from gsseg_core.data.label_images import UNKNOWN, write_mask
+from gsseg_core.data.label_images import UNKNOWN
 from gsseg_core.data.soft_masks import SeenLabels
 from gsseg_core.data.view import View
 from gsseg_core.errors import MaskSizeError, NoUsableViewsError, SettingsError, StateMismatchError, UnknownLabelError
@@ -221,23 +220,6 @@ def test_a_view_of_the_same_name_replaces_the_earlier_one(budget: int) -> None:
     fresh = taught(VoteLearner(SCENE, NUM_CLASSES), [VIEWS[0], other, *VIEWS[2:]])
     np.testing.assert_array_equal(learner._votes.dense(), fresh._votes.dense())
     assert len(learner.views) == 5
-
-
-@pytest.mark.parametrize("budget", [0, 1 << 30])
-def test_a_mask_that_was_corrected_in_its_file_replaces_what_the_file_held_before(budget: int, tmp_path: Path) -> None:
-    view, labels = View(VIEWS[1].camera, tmp_path / "1.png"), VIEWS[1].read_labels()
-    write_mask(view.source, np.full_like(labels, 3), 8)
-    learner = taught(VoteLearner(SCENE, NUM_CLASSES, memory_budget=budget), [VIEWS[0], view])
-    write_mask(view.source, labels, 8)
-    assert learner.observe(view)
-    np.testing.assert_array_equal(
-        learner._votes.dense(), taught(VoteLearner(SCENE, NUM_CLASSES), VIEWS[:2])._votes.dense()
-    )
-    write_mask(view.source, np.full_like(labels, 2), 8)
-    learner.retract(view.name)
-    np.testing.assert_array_equal(
-        learner._votes.dense(), taught(VoteLearner(SCENE, NUM_CLASSES), VIEWS[:1])._votes.dense()
-    )
 
 
 @pytest.mark.parametrize("kind", [EMLearner, GradientLearner])

@@ -4,15 +4,18 @@ from __future__ import annotations
 
 import tracemalloc
 from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 from small_scenes import NUM_CLASSES, balls_on_a_table, clean_views, taught
 
+from gsseg_core.data.label_images import write_mask
 from gsseg_core.data.soft_masks import SeenLabels
 from gsseg_core.data.view import View
 from gsseg_core.errors import SettingsError
+from gsseg_core.files import scratch_file
 from gsseg_core.learn import prepared_views
 from gsseg_core.learn.em.em_learner import EMLearner
 from gsseg_core.learn.gradient_learner import GradientLearner
@@ -102,6 +105,26 @@ def test_by_default_an_eighth_of_the_free_memory_is_for_prepared_views(monkeypat
     assert VoteLearner(SCENE, NUM_CLASSES).memory_budget == 1 << 30
     monkeypatch.setattr(prepared_views, "free_memory", lambda: None)
     assert VoteLearner(SCENE, NUM_CLASSES).memory_budget == 2 << 30
+
+
+@pytest.mark.parametrize("budget", [0, 1, 1 << 30])
+def test_a_mask_that_was_corrected_in_its_file_replaces_what_the_file_held_before(
+    budget: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(scratch_file, "SPARED", 1 << 60)  # No disk has space for what is beyond the budget.
+    view, labels = View(VIEWS[1].camera, tmp_path / "1.png"), VIEWS[1].read_labels()
+    write_mask(view.source, np.full_like(labels, 3), 8)
+    learner = taught(VoteLearner(SCENE, NUM_CLASSES, memory_budget=budget), [VIEWS[0], view])
+    write_mask(view.source, labels, 8)
+    assert learner.observe(view)
+    np.testing.assert_array_equal(
+        learner._votes.dense(), taught(VoteLearner(SCENE, NUM_CLASSES), VIEWS[:2])._votes.dense()
+    )
+    write_mask(view.source, np.full_like(labels, 2), 8)
+    learner.retract(view.name)
+    np.testing.assert_array_equal(
+        learner._votes.dense(), taught(VoteLearner(SCENE, NUM_CLASSES), VIEWS[:1])._votes.dense()
+    )
 
 
 def test_a_negative_memory_budget_is_refused() -> None:
