@@ -8,7 +8,7 @@ The segmenter here is Felzenszwalb and Huttenlocher's (2004), which needs no wei
 areas of one colour, and numbers them anew in every photo, as automatic mask generators do. To use another one, rewrite
 `segment_photo`; all else stays.
 
-Without images/ in DATASET, `--scene` renders the scene in the place of photos.
+Without images/ in DATASET, `--scene` renders the scene in the place of photos that no lens has bent.
 """
 
 from __future__ import annotations
@@ -44,6 +44,8 @@ def segment_photo(
 def photo_of(view: View, scene: GaussianScene | None) -> np.ndarray:
     """Read the photo of a view, or render it: (H, W, 3) uint8."""
     if scene is not None:
+        if view.camera.undistortion is not None:
+            raise GssegError(f"view '{view.name}' was taken through a lens, as its mask has to be; expected its photo")
         image = make_operator(scene, view.camera).render(scene.colors(view.camera.center))
         return (255 * image.clip(0, 1)).astype(np.uint8)
     if view.image_path is None:
@@ -61,10 +63,10 @@ def main() -> None:
     try:
         views = Dataset(options.dataset).views("train")
         scene = GaussianScene.load(options.scene) if options.scene else None
-        for view in views:
+        for image, view in {view.camera.image: view for view in views}.items():  # A panorama is several views.
             labels = segment_photo(photo_of(view, scene))
-            write_mask(Path(options.dataset) / options.out / f"{view.name}.png", labels, bits=16)
-            print(f"{view.name}: {len(np.unique(labels[labels > 0]))} areas")
+            write_mask(Path(options.dataset) / options.out / f"{image}.png", labels, bits=16)
+            print(f"{image}: {len(np.unique(labels[labels > 0]))} areas")
     except GssegError as error:
         sys.exit(f"masks_from_photos: {error}")
 

@@ -14,6 +14,7 @@ import numpy as np
 import pytest
 from doc_blocks import blocks_of
 from patience import PATIENCE
+from PIL import Image
 from scipy.spatial.transform import Rotation
 from small_scenes import NAMES, write_dataset
 
@@ -22,6 +23,7 @@ from gsseg_core.data.dataset import Dataset
 from gsseg_core.data.label_images import read_mask
 from gsseg_core.data.view import View
 from gsseg_core.demo import table_scene
+from gsseg_core.files.json_files import write_json
 from gsseg_core.scene.gaussian_scene import GaussianScene
 from gsseg_core.segmentation import Segmentation
 
@@ -116,6 +118,26 @@ def test_masks_from_photos_says_what_is_missing_without_photos(tmp_path: Path) -
     ran = run_example("masks_from_photos.py", write_dataset(tmp_path / "data"))
     assert ran.returncode == 1
     assert ran.stderr.count("\n") == 1 and "no photo in images/; give --scene" in ran.stderr
+
+
+@pytest.mark.parametrize("model", ["EQUIRECTANGULAR", "OPENCV"])
+def test_masks_of_photos_that_a_lens_took_are_those_of_the_photos(model: str, tmp_path: Path) -> None:
+    pytest.importorskip("skimage", reason="scikit-image is not installed")
+    data = write_dataset(tmp_path / "data")
+    for name in ("cameras.json", "split.json", "classes.json"):
+        (data / name).unlink()
+    (data / "images").mkdir()
+    areas = np.kron(np.arange(8, dtype=np.uint8).reshape(2, 4) * 30, np.ones((32, 32), np.uint8))
+    Image.fromarray(np.repeat(areas[..., None], 3, axis=2)).save(data / "images/photo.png")
+    lens = {"w": 128, "h": 64, "fl_x": 60.0, "fl_y": 60.0, "cx": 64.0, "cy": 32.0, "k1": -0.1, "camera_model": model}
+    write_json(
+        data / "transforms.json", {**lens, "frames": [{"file_path": "photo", "transform_matrix": np.eye(4).tolist()}]}
+    )
+    ran = run_example("masks_from_photos.py", data)
+    assert ran.stdout.startswith("photo: ") and ran.stdout.count("\n") == 1, ran.stderr
+    assert all((view.read_labels() > 0).any() for view in Dataset(data, "auto").views("train"))
+    ran = run_example("masks_from_photos.py", data, "--scene", data / "scene.ply", "--out", "rendered")
+    assert ran.returncode == 1 and ran.stderr.count("\n") == 1 and "was taken through a lens" in ran.stderr
 
 
 def write_bag(path: Path, views: list[View], distorted: int = -1, topics: tuple[str, ...] = ()) -> None:
