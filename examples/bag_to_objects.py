@@ -48,8 +48,10 @@ def camera_of(name: str, info: Any, pose: Any) -> Camera:
     if np.any(info.d):
         raise GssegError(f"camera_info has distortion {info.d.tolist()}; expected that of a rectified image, all zeros")
     p, q = pose.pose.position, pose.pose.orientation
-    camera_in_map = np.eye(4)
-    camera_in_map[:3, :3] = Rotation.from_quat([q.x, q.y, q.z, q.w]).as_matrix()
+    quaternion, camera_in_map = [q.x, q.y, q.z, q.w], np.eye(4)
+    if not np.linalg.norm(quaternion) > 0:
+        raise GssegError("a pose has a quaternion of zeros, or of NaN; expected x, y, z, w that turn the camera")
+    camera_in_map[:3, :3] = Rotation.from_quat(quaternion).as_matrix()
     camera_in_map[:3, 3] = p.x, p.y, p.z
     return Camera(name, info.width, info.height, info.k.reshape(3, 3), np.linalg.inv(camera_in_map))
 

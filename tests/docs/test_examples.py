@@ -140,8 +140,10 @@ def test_masks_of_photos_that_a_lens_took_are_those_of_the_photos(model: str, tm
     assert ran.returncode == 1 and ran.stderr.count("\n") == 1 and "was taken through a lens" in ran.stderr
 
 
-def write_bag(path: Path, views: list[View], distorted: int = -1, topics: tuple[str, ...] = ()) -> None:
-    """A bag made without ROS; the message of `distorted` has a lens with distortion."""
+def write_bag(
+    path: Path, views: list[View], distorted: int = -1, unturned: int = -1, topics: tuple[str, ...] = ()
+) -> None:
+    """A bag made without ROS; the message of `distorted` has a lens with distortion, and of `unturned` no rotation."""
     from rosbags.rosbag2 import StoragePlugin, Writer
     from rosbags.typesys import Stores, get_typestore
 
@@ -165,7 +167,7 @@ def write_bag(path: Path, views: list[View], distorted: int = -1, topics: tuple[
             pixels = np.where(labels < 0, 255, labels).astype(np.uint8)
             padded = np.pad(pixels, ((0, 0), (0, 3))).ravel()  # A row may be longer than the image is wide.
             pose = np.linalg.inv(camera.world_to_camera)
-            quaternion = Rotation.from_matrix(pose[:3, :3]).as_quat()
+            quaternion = (i != unturned) * Rotation.from_matrix(pose[:3, :3]).as_quat()
             d = np.array([0.1 if i == distorted else 0.0] * 5)
             messages = {
                 "mask": types["Image"](header, height, width, "mono8", 0, width + 3, padded),
@@ -206,9 +208,10 @@ def test_a_bag_skips_what_cannot_be_used_and_names_a_topic_that_is_missing(tmp_p
     pytest.importorskip("rosbags", reason="rosbags is not installed")
     data = write_dataset(tmp_path / "data")
     views, scene = Dataset(data).views("train"), data / "scene.ply"
-    write_bag(tmp_path / "bag", views, distorted=1)
+    write_bag(tmp_path / "bag", views, distorted=1, unturned=2)
     ran = run_example("bag_to_objects.py", scene, tmp_path / "bag", tmp_path / "out")
-    assert "learnt from 3 masks" in ran.stdout and "skipped 1 masks: camera_info has distortion" in ran.stdout
+    assert "learnt from 2 masks" in ran.stdout and "skipped 1 masks: camera_info has distortion" in ran.stdout
+    assert "skipped 1 masks: a pose has a quaternion of zeros" in ran.stdout
     ran = run_example("bag_to_objects.py", scene, tmp_path / "bag", tmp_path / "out", "--mask", "/front/mask")
     assert ran.returncode == 1 and ran.stderr.count("\n") == 1
     assert "no topic /front/mask; topics in the bag: /camera_info, /mask, /pose" in ran.stderr
