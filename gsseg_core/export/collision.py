@@ -114,7 +114,9 @@ def _surface(solid: Ellipsoids) -> TriangleMesh | None:
         return None
     filled = ndimage.binary_fill_holes(ndimage.binary_closing(voxels.filled, iterations=_CLOSED))
     smooth = ndimage.gaussian_filter(filled.astype(np.float32), 1.0)
-    return voxels.mesh(smooth, 0.5 * float(smooth.max()))
+    level = 0.5 * float(smooth.max())
+    # Smoothing may close the mouth of a hollow.
+    return voxels.mesh(ndimage.binary_fill_holes(smooth > level), smooth, level)
 
 
 def _poisson(solid: Ellipsoids) -> TriangleMesh | None:

@@ -46,11 +46,16 @@ class Voxels(NamedTuple):
         found = ((points - self.low) / self.size).astype(np.int64) + self.margin
         return tuple(np.moveaxis(np.clip(found, 0, np.array(self.filled.shape) - 1), -1, 0))
 
-    def mesh(self, values: npt.NDArray[np.floating], level: float) -> TriangleMesh:
-        """Make a mesh of the places where values (X, Y, Z), high inside, cross a level."""
+    def mesh(self, solid: npt.NDArray[np.bool_], values: npt.NDArray[np.floating], level: float) -> TriangleMesh:
+        """Make a mesh around solid voxels (X, Y, Z), where values, high inside, cross a level beside them.
+
+        What is not solid ends below the level, and what is above it, hollows too; nothing is so near to it that
+        triangles lose their area.
+        """
         from skimage.measure import marching_cubes
 
-        points, triangles, _, _ = marching_cubes(values, level, gradient_direction="ascent")
+        away = np.maximum(np.abs(values - level), _APART * float(np.ptp(values)))
+        points, triangles, _, _ = marching_cubes(np.where(solid, away, -away), 0.0, gradient_direction="ascent")
         points = (points - self.margin + 0.5) * self.size + self.low
         return TriangleMesh(points.astype(np.float32), triangles.astype(np.int32))
 
@@ -88,9 +93,7 @@ def poisson_surface(ellipsoids: Ellipsoids, voxels: Voxels) -> TriangleMesh | No
     beyond[(slice(voxels.margin // 2, -voxels.margin // 2),) * 3] = False
     if solid[beyond].any() or ndimage.binary_dilation(solid)[voxels.cells(means)].mean() < _HELD:
         return None
-    # Other pieces end below the level, and hollows above; nothing is so near to it that triangles lose their area.
-    away = np.maximum(np.abs(inside - level), _APART * float(np.ptp(inside)))
-    return voxels.mesh(np.where(solid, away, -away), 0.0)
+    return voxels.mesh(solid, inside, level)
 
 
 def _normals(ellipsoids: Ellipsoids, voxels: Voxels) -> npt.NDArray[np.float64]:

@@ -164,6 +164,16 @@ def shells(points: np.ndarray, scale: float | tuple[float, float, float]) -> tup
     return scene, Segmentation.from_codes(scene, codes, names, RefineSettings(cluster=False))
 
 
+@pytest.mark.parametrize(("seed", "count", "sides", "scale"), [(7, 1400, (1, 0.35, 0.35), 0.04), (16, 1500, 1, 0.05)])
+def test_a_surface_of_whatever_shape_is_watertight_and_has_no_cavity(
+    seed: int, count: int, sides: float | tuple[float, float, float], scale: float
+) -> None:
+    points = np.random.default_rng(seed).uniform(-1, 1, (count, 3)) * sides
+    mesh = meshes_in(*shells(points, scale), SURFACE)[1]
+    closed = trimesh.Trimesh(mesh.points, mesh.triangles)  # Corners in one place become one.
+    assert closed.is_watertight and all(piece.volume > 0 for piece in closed.split())
+
+
 def test_a_poisson_surface_closes_a_box_without_a_bottom_and_leaves_a_bowl_hollow() -> None:
     rng = np.random.default_rng(0)
     walls = []
