@@ -90,7 +90,11 @@ class OrientedBox:
 
     def as_dict(self) -> dict[str, Any]:
         """Write it in plain lists, as in report.json: `axes` is a list of directions, the longest side's first."""
-        return {name: _rounded(value) for name, value in {**vars(self), "axes": self.axes.T}.items()}
+        places = dict.fromkeys(("center", "mean"), float(self.size[0]))  # However far away, as exact as the size.
+        return {
+            name: _rounded(value, places.get(name, np.inf))
+            for name, value in {**vars(self), "axes": self.axes.T}.items()
+        }
 
 
 def oriented_box(
@@ -272,7 +276,7 @@ def _pointed(axes: Array) -> Array:
     return np.stack([first, second, _across(first, second)], axis=1)
 
 
-def _rounded(values: Array) -> Any:
-    """Six significant digits of the largest."""
-    largest = float(np.abs(values).max())
+def _rounded(values: Array, unit: float) -> Any:
+    """Six significant digits of the largest, or of a unit that is smaller."""
+    largest = min(float(np.abs(values).max()), unit)
     return values.round(5 - int(np.floor(np.log10(largest)))).tolist() if largest else values.tolist()

@@ -201,6 +201,13 @@ def test_a_box_as_a_dictionary_is_plain_json(segmented: tuple[GaussianScene, Seg
         np.testing.assert_allclose(written[name], getattr(box, name), atol=1e-5)
 
 
+def test_a_box_far_from_the_origin_is_written_as_exactly_as_it_is_large() -> None:
+    box = box_around(cuboid(500) + np.array([500_123.4, 4_123_456.7, 80.2]))
+    written = box.as_dict()
+    for name in ("center", "mean"):
+        np.testing.assert_allclose(written[name], getattr(box, name), rtol=0, atol=1e-5)
+
+
 def test_the_report_of_a_run_has_the_boxes_of_its_objects(segmented: tuple[GaussianScene, Segmentation]) -> None:
     report = RunReport.of(*segmented, views={}, settings={}, seconds={}, files={}).as_dict()
     boxes = {entry["id"]: entry["box"] for entry in report["classes"]}
