@@ -13,7 +13,7 @@ import numpy as np
 from numpy.lib.recfunctions import repack_fields
 
 from gsseg_core.export.collision import check_collision, collision_meshes
-from gsseg_core.files.atomic import write_atomically
+from gsseg_core.files.atomic import check_replaceable, write_atomically
 from gsseg_core.files.run_folder import staged_run
 from gsseg_core.scene.gaussian_scene import GaussianScene
 from gsseg_core.scene.ply import write_parts
@@ -122,18 +122,23 @@ def write_selection(
 
     Meshes to collide with go into the USD, or beside another file, as `<its stem>_<id>_<name>.obj`; those that an
     earlier call wrote there for other classes are removed. If anything cannot be written, all files are as they were.
-    Raises what `gsseg_core.scene.scene_writers.write_scene` does, and `EmptySceneError` where none is chosen.
+    Raises what `gsseg_core.scene.scene_writers.write_scene` does, `EmptySceneError` where none is chosen, and
+    `PathTakenError` where a file that is none of these is in the place of a mesh.
     """
     part = scene.subset(chosen)
     if not SCENE_WRITERS[scene_format].together:
         stem = stem_of(path, scene_format)
         places = {k: Path(path).with_name(f"{stem}_{mesh_file_name(k, name)}") for k, name in class_names.items()}
+        for k in meshes or {}:
+            check_replaceable(places[k], "mesh of an earlier call", _is_lone_mesh(places[k]))
         with ExitStack() as written:  # Meshes get their names once the scene has its own.
             for k, mesh in (meshes or {}).items():
                 mesh.write(written.enter_context(write_atomically(places[k])))
             write_scene(part, path, scene_format)
         for k in () if meshes is None else places.keys() - meshes.keys():
-            _remove_mesh(places[k])
+            if _is_lone_mesh(places[k]) and not places[k].is_symlink():
+                with suppress(OSError):
+                    places[k].unlink()
         return
     labels = labels[chosen]
     objects = _objects(part, _members(labels), class_names, meshes or {})
@@ -142,14 +147,13 @@ def write_selection(
     write_objects(objects, path, scene_format)
 
 
-def _remove_mesh(path: Path) -> None:
-    """Remove the mesh of an earlier selection, if that is what is there."""
+def _is_lone_mesh(path: Path) -> bool:
+    """Whether a file is a mesh of an earlier selection."""
     with suppress(OSError, UnicodeDecodeError):
-        if path.is_file() and not path.is_symlink():
+        if path.is_file():
             with open(path, encoding="ascii") as file:
-                is_ours = file.readline(len(LONE)) == LONE
-            if is_ours:
-                path.unlink()
+                return file.readline(len(LONE)) == LONE
+    return False
 
 
 def _members(labels: np.ndarray) -> dict[int, np.ndarray]:  # (N,) int

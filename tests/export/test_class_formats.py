@@ -15,7 +15,7 @@ from pxr import Usd, UsdGeom, UsdPhysics, UsdSemantics
 from small_scenes import NAMES, NUM_CLASSES, balls_on_a_table
 
 from gsseg_core.data.class_names import MAX_CLASS_NAME
-from gsseg_core.errors import EmptySceneError, SettingsError
+from gsseg_core.errors import EmptySceneError, PathTakenError, SettingsError
 from gsseg_core.export import class_files
 from gsseg_core.export.class_files import class_file_name, export_classes, write_selection
 from gsseg_core.export.collision import HULL, KINDS, POISSON, SURFACE, collision_meshes
@@ -258,6 +258,14 @@ def test_a_selection_in_usd_keeps_its_classes_apart(tmp_path: Path) -> None:
     with pytest.raises(EmptySceneError):
         write_selection(SCENE, TRUTH > 9, labels, NAMES, tmp_path / "none.usda", "usd", {})
     assert not (tmp_path / "none.usda").exists()
+
+
+def test_a_selection_replaces_no_mesh_of_others(tmp_path: Path) -> None:
+    edited = tmp_path / "rest_2_cup_mug.obj"
+    edited.write_text("# Blender\n")
+    with pytest.raises(PathTakenError, match=r"rest_2_cup_mug\.obj: is there and is no mesh of an earlier call"):
+        write_selection(SCENE, TRUTH < 9, TRUTH, NAMES, tmp_path / "rest.ply", "ply", meshes_of(HULL))
+    assert visible(tmp_path) == [edited.name] and edited.read_text() == "# Blender\n"
 
 
 def test_a_format_or_mesh_that_is_not_there_is_refused_before_anything_is_written(tmp_path: Path) -> None:
