@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
@@ -54,6 +55,16 @@ class VoteLearner(Learner):
         """
         before, after = self._observed(view.name), view.held()
         self._exchange(before, after, self._operator_of(after))
+
+    def checkpoint(self) -> Callable[[], None]:
+        """Return what goes back to the present views and votes, after anything but `forget`; it takes no memory."""
+        votes, views, num_classes, dropped = self._votes.copy(), dict(self.views), self.num_classes, self.dropped
+
+        def undo() -> None:
+            self._votes, self.views, self.num_classes, self.dropped = votes, views, num_classes, dropped
+            self._prepared.clear()
+
+        return undo
 
     def keep_last(self, count: int) -> None:
         """Drop the oldest views and their masks, all but so many, of at least one; their votes stay."""

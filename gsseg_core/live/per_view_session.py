@@ -90,39 +90,49 @@ class PerViewSession(LiveSession):
         Raises
         ------
         UnknownLabelError
-            There would be more objects than `max_classes`. Nothing has changed.
+            There would be more objects than `max_classes`. Nothing has changed, as after any error.
         """
         with self._lock:
-            undo, every = self._table.checkpoint(), list(self._live.views)
+            undo, back = self._table.checkpoint(), None
             try:
                 repair, order = self._table.solve(), [name for name in self._live.views if self._table.sees(name)]
-                moved = (repair.successors != np.arange(len(repair.successors))).any()
+                moved = bool((repair.successors != np.arange(len(repair.successors))).any())
                 forgotten = self.num_fused > len(order)
                 names = order if moved and forgotten else [name for name in order if name in set(repair.changed)]
                 views = {name: self._table.relabelled(self._table.views[name]) for name in names}
+                learnt = _renumbered(self._learnt, repair.successors) if self._learnt and moved else self._learnt
                 if views:  # All at once: if there is no room for all, there are no more classes than before.
+                    back = self._live.checkpoint()
                     self._grow_for(max(views.values(), key=lambda view: view.largest_label))
+                self._relabel(views, repair.successors if moved and forgotten else None)
             except BaseException:
                 undo()
+                if back is not None:
+                    back()
                 raise
-            if moved and forgotten:  # What is left once the views have gone is of those that are no longer kept.
-                for name in names:
-                    self._live.retract(name)
-                left, most = self._live.state(), int(repair.successors.max()) + 1
-                votes = _added_up(left.votes, repair.successors).nonzero()
-                self._live.adopt(replace(left, votes=votes, num_classes=max(left.num_classes, most)))
-                for view in views.values():
-                    self._live.observe(view)
-            else:
-                for view in views.values():
-                    self._live.relabel(view)
-            # The oldest view still is the first one to go.
-            self._live.views = {name: self._live.views[name] for name in every if name in self._live.views}
             if moved:
                 self._repairs.append(repair.successors)
-                self._learnt = self._learnt and _renumbered(self._learnt, repair.successors)
+            self._learnt = learnt
             self._version += 1
         return repair
+
+    def _relabel(self, views: Mapping[str, View], successors: np.ndarray | None) -> None:
+        """Put views in the places of those of their names; with successors, other votes go along with their objects."""
+        every = list(self._live.views)
+        if successors is None:
+            for view in views.values():
+                self._live.relabel(view)
+            return
+        # What is left once the views have gone is of those that are no longer kept.
+        for name in views:
+            self._live.retract(name)
+        left, most = self._live.state(), int(successors.max()) + 1
+        votes = _added_up(left.votes, successors).nonzero()
+        self._live.adopt(replace(left, votes=votes, num_classes=max(left.num_classes, most)))
+        for view in views.values():
+            self._live.observe(view)
+        # The oldest view still is the first one to go.
+        self._live.views = {name: self._live.views[name] for name in every if name in self._live.views}
 
     def at_level(self, result: Segmentation, granularity: float | None) -> Segmentation:
         """Cut a result of `segmentation` at a level of the tree of parts and wholes, by the views that are kept now.

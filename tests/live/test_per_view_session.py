@@ -239,24 +239,33 @@ def test_a_view_that_there_is_no_memory_for_changes_nothing(
     np.testing.assert_array_equal(session.codes(), other.codes())
 
 
-@pytest.mark.parametrize("starved", ["solve", "relabelled"])
-def test_a_repair_that_there_is_no_memory_for_changes_nothing(starved: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    session = PerViewSession(SCENE)
-    for view in [in_halves(VIEWS[0], 1), *VIEWS[1:4]]:
-        assert session.fuse(shuffled(view)) is None
+@pytest.mark.parametrize(
+    ("owner", "starved", "kept"),
+    [(ObjectTable, "solve", 9), (ObjectTable, "relabelled", 9), (VoteLearner, "relabel", 9),
+     (VoteLearner, "retract", 5), (VoteLearner, "adopt", 5), (VoteLearner, "observe", 5)],
+)  # fmt: skip
+def test_a_repair_that_there_is_no_memory_for_changes_nothing(
+    owner: type, starved: str, kept: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    session, other = PerViewSession(SCENE, max_views=kept), PerViewSession(SCENE, max_views=kept)
+    for view in [without(VIEWS[7], 1), in_halves(VIEWS[0], 1), *VIEWS[1:5]]:
+        assert session.fuse(shuffled(view)) is None and other.fuse(shuffled(view)) is None
     before, found = session.codes(), {name: ids.tolist() for name, ids in session._table._objects.items()}
-    work = getattr(ObjectTable, starved)
+    work = getattr(owner, starved)
 
     def without_memory(*given: Any) -> None:
         work(*given)
         raise MemoryError
 
     with monkeypatch.context() as patch, pytest.raises(MemoryError):
-        patch.setattr(ObjectTable, starved, without_memory)
+        patch.setattr(owner, starved, without_memory)
         session.repair()
     np.testing.assert_array_equal(session.codes(), before)
     assert {name: ids.tolist() for name, ids in session._table._objects.items()} == found
-    assert session.repair().changed
+    assert session.view_names == other.view_names
+    for each in (session, other):
+        assert each.repair().changed
+    np.testing.assert_array_equal(session.codes(), other.codes())
 
 
 def test_a_repair_that_finds_too_many_objects_changes_nothing() -> None:
