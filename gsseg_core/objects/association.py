@@ -18,8 +18,8 @@ all are, and they hardly ever make a vote together.
    is; two objects only where both happen to be whole and have been merged as well. A view in which half of C is merged
    with D, as where many neighbours are, does not count. What has merged by mistake is hardly shown whole by any view,
    and what the last few say must not join more to it: so a view that disagrees is added to each pair, or less where
-   there are few in all. A view whose masks lie in each other has half a vote by its finest ones, and half by its
-   outermost ones.
+   there are few in all. A view whose masks lie in each other has two thirds of a vote by its finest ones, and
+   a third by its outermost ones.
 2. **Clusters merge**, the most agreed pairs first; what has merged is compared anew, with the evidence of all its
    segments together. Down to an agreement of 0.6 that is so whatever the segmenter does. Where then hardly any clusters
    that touch agree by 0.3 to 0.6, no object comes in parts, and merging goes on to one half only: small ones must not

@@ -13,7 +13,7 @@ from gsseg_core.objects.depth_edges import Borders
 from gsseg_core.objects.lifted_segments import Lifted, sums, without_gaps
 from gsseg_core.objects.sparse_products import product_above
 
-_HALF = np.float32(np.sqrt(0.5))  # squared, what a vote by finest masks or by wholes is worth where there are both
+_BY_WHOLES = 1 / 3  # of a view's vote; with a half, wholes that all views agree on would join objects by themselves
 _LEAST = 0.01  # of what a view sees of a segment: what has no larger a share in common with it is taken for nothing
 
 
@@ -21,7 +21,7 @@ class Voters(NamedTuple):
     """Ids by which views vote: segments, and in views whose masks lie in others the wholes that these make up."""
 
     view: np.ndarray  # (n + W,) int64
-    share: np.ndarray  # (n + W,) float32: root of what a vote is worth, of a whole and of a segment that is in one half
+    share: np.ndarray  # (n + W,) float32: root of what a vote is worth, `_BY_WHOLES` of a whole, the rest of its parts
 
 
 class Stack:
@@ -43,9 +43,8 @@ class Stack:
         wholes = [view.wholes_of_several() for view in self.views]
         members = sparse.block_diag(wholes, format="csr").T.tocsr()
         of_wholes = np.repeat(np.arange(len(wholes)), [part.shape[0] for part in wholes])
-        share = np.where(np.diff(members.indptr) > 0, _HALF, np.float32(1))
-        voters = Voters(np.append(self.view, of_wholes), np.append(share, np.full(len(of_wholes), _HALF)))
-        return members, voters
+        worth = np.where(np.diff(members.indptr) > 0, 1 - _BY_WHOLES, 1), np.full(len(of_wholes), _BY_WHOLES)
+        return members, Voters(np.append(self.view, of_wholes), np.sqrt(np.concatenate(worth), dtype=np.float32))
 
     def weights(self) -> sparse.csr_matrix:
         """Weights of the segments on the Gaussians, (n, I) float32, in px."""

@@ -11,10 +11,12 @@ from small_scenes import NUM_CLASSES, balls_on_a_table, clean_views
 
 from gsseg_core.data.soft_masks import SeenLabels
 from gsseg_core.data.view import View
+from gsseg_core.learn.em.em_learner import EMLearner
 from gsseg_core.objects.lifted_segments import Lifted
 from gsseg_core.objects.object_table import find_objects
 from gsseg_core.objects.tree_growing import grow_tree
 from gsseg_core.raster.backends import make_operator
+from gsseg_core.segmentation import Segmentation
 
 SCENE, TRUTH = balls_on_a_table()
 
@@ -27,12 +29,23 @@ def in_halves_of_one_whole(view: View, wholes: tuple[int, ...]) -> View:
     return View.from_seen(view.camera, SeenLabels(cut, outermost=outermost))
 
 
-def test_parts_that_lie_in_a_mask_of_the_whole_are_one_object() -> None:
-    wholes = [in_halves_of_one_whole(view, (51,) if i % 8 else ()) for i, view in enumerate(clean_views(16))]
-    table = find_objects(SCENE, wholes)
+def test_parts_that_lie_in_a_mask_of_the_whole_are_one_object_if_some_views_show_it_in_one_piece() -> None:
+    views = [in_halves_of_one_whole(view, (51,)) if i % 4 else view for i, view in enumerate(clean_views(16))]
+    table = find_objects(SCENE, views)
     assert table.num_objects == 3 and agreement(table, clean_views(16)) == 1.0
-    flat = find_objects(SCENE, [View.from_arrays(view.camera, view.read_labels()) for view in wholes])
+    flat = find_objects(SCENE, [View.from_arrays(view.camera, view.read_labels()) for view in views])
     assert flat.num_objects > 3
+
+
+def test_parts_that_all_views_show_apart_are_parts_of_a_whole_and_no_object() -> None:
+    table = find_objects(SCENE, [in_halves_of_one_whole(view, (51,)) for view in clean_views(16)])
+    assert table.num_objects == 4
+    learner = EMLearner(SCENE, 5)
+    learner.observe_all([table.relabelled(in_halves_of_one_whole(view, (51,))) for view in clean_views(16)])
+    tree = table.with_tree(Segmentation.from_codes(SCENE, learner.fit().codes_, table.class_names)).tree
+    assert tree is not None
+    halves = {k for k in range(1, 5) if tree.parents[k] >= 5}
+    assert len(halves) == 2 and len({tree.parents[k] for k in halves}) == 1
 
 
 def test_objects_that_lie_in_one_mask_while_each_has_its_own_stay_two() -> None:
