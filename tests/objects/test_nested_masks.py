@@ -38,10 +38,11 @@ def test_parts_that_lie_in_a_mask_of_the_whole_are_one_object_if_some_views_show
 
 
 def test_parts_that_all_views_show_apart_are_parts_of_a_whole_and_no_object() -> None:
-    table = find_objects(SCENE, [in_halves_of_one_whole(view, (51,)) for view in clean_views(16)])
+    views = [in_halves_of_one_whole(view, (51,)) for view in clean_views(16)]
+    table = find_objects(SCENE, views)
     assert table.num_objects == 4
     learner = EMLearner(SCENE, 5)
-    learner.observe_all([table.relabelled(in_halves_of_one_whole(view, (51,))) for view in clean_views(16)])
+    learner.observe_all([table.relabelled(view) for view in views])
     tree = table.with_tree(Segmentation.from_codes(SCENE, learner.fit().codes_, table.class_names)).tree
     assert tree is not None
     halves = {k for k in range(1, 5) if tree.parents[k] >= 5}
