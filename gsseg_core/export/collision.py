@@ -16,7 +16,7 @@ import numpy.typing as npt
 
 from gsseg_core.errors import SettingsError
 from gsseg_core.export.poisson_surface import Ellipsoids, Voxels, poisson_surface, sphere
-from gsseg_core.objects.occupied_cells import OPAQUE
+from gsseg_core.objects.occupied_cells import OPAQUE, samples
 from gsseg_core.objects.oriented_boxes import without_floaters
 from gsseg_core.progress import Progress, silent
 from gsseg_core.scene.gaussian_scene import GaussianScene
@@ -32,6 +32,7 @@ VOXELS = 64  # along the longest side of the object
 _MARGIN = 4  # voxels around the ellipsoids, for closing and smoothing
 _CLOSED = 2  # voxels to either side, by which what is filled is dilated to close gaps, and then eroded
 _SAMPLES = 128  # points of an ellipsoid, by which it fills voxels
+_WIDE, _APART = 3, 0.5  # voxels: width from which on it has gaps between these, and how far apart more of them are
 _AT_ONCE = 1 << 14  # ellipsoids at a time, to keep memory small
 _POISSON_MARGIN = 16  # voxels around a Poisson surface, whose grid is periodic
 
@@ -139,6 +140,9 @@ def _filled(solid: Ellipsoids, margin: int = _MARGIN) -> Voxels | None:
     for first in range(0, len(means), _AT_ONCE):
         own = slice(first, first + _AT_ONCE)
         voxels.filled[voxels.cells(means[own, None] + np.einsum("sk,mjk->msj", _BALL, half_axes[own]))] = True
+    wide = 2 * np.linalg.norm(half_axes, axis=1).max(axis=1) > _WIDE * voxel
+    for points in samples(means[wide], half_axes[wide], _APART * voxel):
+        voxels.filled[voxels.cells(points)] = True
     return voxels
 
 

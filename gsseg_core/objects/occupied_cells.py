@@ -33,7 +33,7 @@ def occupied_cells(
     if not 0 < size < np.inf:
         raise SettingsError(f"size of a cell is {size}; expected a number above 0")
     keys, heights = [np.empty((0, 2), np.int64)], [np.empty(0)]
-    for points in _samples(np.asarray(means, np.float64), np.asarray(half_axes, np.float64), size):
+    for points in samples(np.asarray(means, np.float64), np.asarray(half_axes, np.float64), size):
         points = points[(points[:, 2] >= low) & (points[:, 2] <= high)]
         cells, z = _lowest(np.floor(points[:, :2] / size).astype(np.int64), points[:, 2])
         keys.append(cells)
@@ -53,12 +53,12 @@ def _lowest(
     return cells[first], heights[first]
 
 
-def _samples(
+def samples(
     means: npt.NDArray[np.float64],  # (N, 3)
     half_axes: npt.NDArray[np.float64],  # (N, 3, 3)
     size: float,
 ) -> Iterator[npt.NDArray[np.float64]]:
-    """Points (n, 3) of the ellipsoids, some at a time; less than a cell apart along each axis, unless too many."""
+    """Points (n, 3) of the ellipsoids, some at a time; less than a size apart along each axis, unless too many."""
     lengths = np.linalg.norm(half_axes, axis=1)  # (N, 3)
     # Powers of two: few different grids, each for many ellipsoids at once.
     powers = np.ceil(np.log2(np.maximum(2 * lengths / size, 1)))

@@ -174,6 +174,12 @@ def test_a_surface_of_whatever_shape_is_watertight_and_has_no_cavity(
     assert closed.is_watertight and all(piece.volume > 0 for piece in closed.split())
 
 
+def test_a_surface_around_few_and_wide_gaussians_has_neither_gaps_nor_pieces() -> None:
+    mesh = meshes_in(*shells(np.array([[-0.5, 0, 0], [0.5, 0, 0]]), (0.5, 0.4, 0.3)), SURFACE)[1]
+    closed = trimesh.Trimesh(mesh.points, mesh.triangles)
+    assert closed.body_count == 1 and closed.volume == pytest.approx(2 * 4 / 3 * np.pi * 0.5 * 0.4 * 0.3, rel=0.1)
+
+
 def test_a_poisson_surface_closes_a_box_without_a_bottom_and_leaves_a_bowl_hollow() -> None:
     rng = np.random.default_rng(0)
     walls = []
