@@ -113,24 +113,27 @@ def _pixels(name: object, load: Load, count: int) -> Pixels:
         return np.asarray(image.convert("RGBA")).reshape(-1, 4)[:count]
 
 
-def _numbers(values: Any, what: str, count: int | None = None) -> npt.NDArray[np.float32]:
+def _numbers(
+    values: Any, what: str, count: int | None = None, dtype: npt.DTypeLike = np.float32
+) -> npt.NDArray[np.floating]:
     with np.errstate(over="ignore"):  # What is infinite then is reported by the scene.
-        numbers = np.asarray(values, np.float32).reshape(-1)
+        numbers: npt.NDArray[np.floating] = np.asarray(values, dtype).reshape(-1)
     if count is not None and len(numbers) != count:
         raise UnfitError(f"has {len(numbers)} numbers in {what}; expected {count}")
     return numbers
 
 
-def _means(meta: Any, low: Pixels, high: Pixels) -> npt.NDArray[np.float32]:
+def _means(meta: Any, low: Pixels, high: Pixels) -> npt.NDArray[np.floating]:
     """Positions (N, 3), of which sign(x) ln(1 + |x|) is stored in 16 bits between extremes."""
-    steps = (low[:, :3] | high[:, :3].astype(np.uint16) << 8).astype(np.float32) / np.float32(65535)
-    least, most = (_numbers(meta[key], f"means.{key}", 3) for key in ("mins", "maxs"))
+    steps = (low[:, :3] | high[:, :3].astype(np.uint16) << 8) / 65535
+    # In float32 the logarithm of what is 4,000 km away would be off by metres.
+    least, most = (_numbers(meta[key], f"means.{key}", 3, np.float64) for key in ("mins", "maxs"))
     with np.errstate(all="ignore"):  # What is NaN or infinite is reported by the scene.
         logs = least + steps * (most - least)
         return np.sign(logs) * np.expm1(np.abs(logs))
 
 
-def _values(meta: Any, pixels: Pixels, first: int = 0) -> npt.NDArray[np.float32]:  # (N, C)
+def _values(meta: Any, pixels: Pixels, first: int = 0) -> npt.NDArray[np.floating]:  # (N, C)
     """Values of bytes: by a code book of 256, or in version 1 between extremes of each channel."""
     if "codebook" in meta:
         return _numbers(meta["codebook"], "codebook", 256)[pixels]
@@ -139,7 +142,7 @@ def _values(meta: Any, pixels: Pixels, first: int = 0) -> npt.NDArray[np.float32
     return least + pixels / np.float32(255) * (most - least)
 
 
-def _extremes(values: Any, what: str) -> npt.NDArray[np.float32]:
+def _extremes(values: Any, what: str) -> npt.NDArray[np.floating]:
     """Take extremes of up to four channels; a single number is that of all."""
     numbers = _numbers(values, what)
     return numbers if len(numbers) > 1 else numbers.repeat(4)
@@ -154,7 +157,7 @@ def _rotations(pixels: Pixels) -> npt.NDArray[np.float32]:
     return from_smallest_three(largest, others)
 
 
-def _rest(meta: Any, labels: Pixels, load: Load) -> npt.NDArray[np.float32]:
+def _rest(meta: Any, labels: Pixels, load: Load) -> npt.NDArray[np.floating]:
     """Coefficients (N, B, 3) of SH above degree 0: each Gaussian names an entry of a palette."""
     with _image(meta["files"][0], load, len(labels)) as image:
         palette = np.asarray(image.convert("RGB"))

@@ -23,6 +23,7 @@ from gsseg_core.scene.gaussian_scene import GaussianScene
 from gsseg_core.scene.moving import move
 from gsseg_core.scene.quaternions import covariances
 from gsseg_core.scene.scene_formats import SCENE_FORMATS, find_format, read_scene
+from gsseg_core.scene.scene_writers import write_scene
 from gsseg_core.scene.vertices import log_scales, logits, pack_vertices
 
 Write = Callable[[Path, GaussianScene], None]
@@ -122,6 +123,13 @@ def test_spz_of_another_implementation_is_read_record_by_record(
     found = GaussianScene.load(tmp_path / "a.spz")
     turned = GaussianScene.from_arrays(**half_turned(scene, scene_files.FLIP_SPZ))
     check_same(found, turned, CASES["SPZ 2"]._replace(color=0.15))
+
+
+def test_a_sog_in_coordinates_of_a_map_is_read_as_exactly_as_float32_allows(tmp_path: Path) -> None:
+    near = some_scene(200, 0)
+    scene = GaussianScene.from_arrays(near.means + (4.5e5, 4e6, 0), near.quats, near.scales, near.opacities, near.sh)
+    write_scene(scene, tmp_path / "a.sog")
+    assert (np.abs(GaussianScene.load(tmp_path / "a.sog").means - scene.means) <= (0.03125, 0.25, 1e-3)).all()
 
 
 def test_sog_of_another_implementation_is_read_in_the_order_of_its_images(tmp_path: Path) -> None:
