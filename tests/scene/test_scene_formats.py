@@ -127,7 +127,8 @@ def test_spz_of_another_implementation_is_read_record_by_record(
 
 def test_a_sog_in_coordinates_of_a_map_is_read_as_exactly_as_float32_allows(tmp_path: Path) -> None:
     near = some_scene(200, 0)
-    scene = GaussianScene.from_arrays(near.means + (4.5e5, 4e6, 0), near.quats, near.scales, near.opacities, near.sh)
+    means = near.means + np.array([4.5e5, 4e6, 0])
+    scene = GaussianScene.from_arrays(means, near.quats, near.scales, near.opacities, near.sh)
     write_scene(scene, tmp_path / "a.sog")
     assert (np.abs(GaussianScene.load(tmp_path / "a.sog").means - scene.means) <= (0.03125, 0.25, 1e-3)).all()
 
