@@ -227,6 +227,7 @@ def test_a_video_of_cvat_is_refused_with_what_to_do(tmp_path: Path) -> None:
         ("0 0 0 0.5 1e9 1 1", "has the coordinate 1e+09"),
         ("0 0 0 0.5 0.5 1 1\n0 0 0 0.5 x 1 1", "line 2: is '0 0 0 0.5 x 1 1'; expected a class and pairs"),
         ("0 0.5 0.5 0.2 0.2 0.9", "line 1: is a box"),
+        ("0 0.5 0.5 0.2 0.2 0.9 7", "line 1: is a box"),
         ("99999999 0 0 0.5 0.5 1 1", "expected a class and pairs"),
         ("65535 0 0 0.5 0.5 1 1", "has the id 65535"),
     ],

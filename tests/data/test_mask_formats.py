@@ -250,6 +250,29 @@ def test_yolo_takes_predictions_as_they_are_saved(tmp_path: Path, end: str) -> N
     np.testing.assert_array_equal(found, expected)
 
 
+def test_yolo_with_confidences_and_tracks_has_no_point_of_them(tmp_path: Path) -> None:
+    """Ultralytics' `track` with `save_conf`; the third view had no track, so that its line ends with a confidence."""
+    make_cameras(tmp_path)
+    (tmp_path / "labels").mkdir()
+    half = "0 0 0 0.5 0 0.5 1 0 1"
+    (tmp_path / "labels/frame_001.txt").write_text(f"{half} 0.87 1\n")
+    (tmp_path / "labels/frame_002.txt").write_text(f"{half} 0.9 1\n1 0.91 2\n1 0.5 0.5 0.8123 3\n")
+    (tmp_path / "labels/frame_003.txt").write_text(f"{half} 0.34\n")
+    for view in Dataset(tmp_path).views()[:3]:
+        labels = view.read_labels()
+        middle = labels.shape[1] // 2
+        assert (labels[:, :middle] == 1).all() and (labels[:, middle:] == 0).all()
+
+
+def test_yolo_whose_lines_end_with_points_or_with_the_one_track_is_refused(tmp_path: Path) -> None:
+    make_cameras(tmp_path)
+    (tmp_path / "labels").mkdir()
+    for stem in STEMS[:2]:
+        (tmp_path / f"labels/{stem}.txt").write_text("0 0 0 0.5 0 0.5 0.5 0 0.5 0.81 1\n")
+    with pytest.raises(MaskFormatError, match=r"lines end with '0\.81 1' and the like"):
+        Dataset(tmp_path)
+
+
 def test_yolo_takes_names_from_classes_txt(tmp_path: Path) -> None:
     make_cameras(tmp_path)
     (tmp_path / "texts").mkdir()

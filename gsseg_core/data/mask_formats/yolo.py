@@ -1,13 +1,14 @@
 """YOLO segmentation: a text file per image, in each line a class and a polygon in shares of the image's size.
 
 Class c is id c + 1, since its 0 is an object. Names come from `data.yaml` or else `classes.txt`, beside the texts or up
-to two folders above. The last line is on top. Predictions may end a line with a confidence, or with
-the id of a track, which are left out; of an object of a pixel or two they have one or two points, which cover nothing.
+to two folders above. The last line is on top. Predictions may end a line with a confidence, the id of a track, or
+both, which are left out; of an object of a pixel or two they have one or two points, which cover nothing.
 """
 
 from __future__ import annotations
 
 import re
+from collections.abc import Iterable
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -27,6 +28,7 @@ from gsseg_core.text import quoted
 _NUMBER, _END = r"(?:[ \t]+[-+0-9.eE]+)", r"[ \t]*(?:[\r\n]|$)"
 _LINE = rf"(?:\xef\xbb\xbf)?\s*(?:(?:[0-9]+{_NUMBER}{{0,3}}[ \t]*[\r\n]+)*[0-9]+{_NUMBER}{{4,}}{_END}|$)".encode()
 _BOX = 4
+_TRACK = re.compile(r"\s0\.[0-9]+\s+([0-9]{1,9})\s*$")  # a confidence and an id
 
 
 def is_yolo(place: Place) -> bool:
@@ -38,9 +40,10 @@ def is_yolo(place: Place) -> bool:
 def read_yolo(place: Place) -> MaskSet:
     """Read YOLO; each file is read once for its classes, and again when its view is asked for."""
     files = place.by_view(".txt")
-    ids = {label for path in files.values() for label, _ in _lines(place, path)}
+    tracked = _are_tracked(place, files.values())
+    ids = {label for path in files.values() for label, _ in _lines(place, path, tracked)}
     names = _names(place)
-    views = {view: ViewMask(str(path), partial(_read, place, path)) for view, path in files.items()}
+    views = {view: ViewMask(str(path), partial(_read, place, path, tracked)) for view, path in files.items()}
     if names is None:
         names = {label - 1: f"class_{label - 1:02d}" for label in sorted(ids)}
     elif lacking := sorted(ids - {c + 1 for c in names}):
@@ -50,18 +53,35 @@ def read_yolo(place: Place) -> MaskSet:
     return MaskSet(views, {0: BACKGROUND_NAME, **{c + 1: name for c, name in sorted(names.items())}})
 
 
-def _read(place: Place, path: Path, camera: Camera) -> npt.NDArray[np.int32]:
+def _are_tracked(place: Place, paths: Iterable[Path]) -> bool:
+    """Whether lines end with a confidence and the id of a track, which together look like a point.
+
+    An id above 1 is no share of an image. Raises `MaskFormatError` where a track of the id 1 is all that there may be.
+    """
+    lines = [[line for line in place.text(path).splitlines() if len(line.split()) % 2] for path in paths]
+    ids = [[int(end[1]) if (end := _TRACK.search(line)) else 0 for line in of_view] for of_view in lines]
+    every = [one for of_view in ids for one in of_view]
+    if len(every) > 1 and set(every) == {1} and max(map(len, ids)) == 1:
+        found = quoted(" ".join(next(filter(None, lines))[0].split()[-2:]))
+        raise MaskFormatError(
+            f"{place.path}: lines end with {found} and the like, which may be a point, or a confidence and the id of a "
+            "track; expected no confidences (save_conf=False of Ultralytics)"
+        )
+    return max(every, default=0) > 1
+
+
+def _read(place: Place, path: Path, tracked: bool, camera: Camera) -> npt.NDArray[np.int32]:
     size = camera.image_size
     shapes = []
-    for i, (label, points) in enumerate(_lines(place, path), 1):
+    for i, (label, points) in enumerate(_lines(place, path, tracked), 1):
         shapes.append(Shape(label, Polygons.of((points * np.array(size)).tolist(), f"{path}, outline {i}")))
     return Drawing(*size, shapes).labels(camera, str(path))
 
 
-def _lines(place: Place, path: Path) -> list[tuple[int, npt.NDArray[np.float64]]]:
+def _lines(place: Place, path: Path, tracked: bool) -> list[tuple[int, npt.NDArray[np.float64]]]:
     """Label and polygon (P, 2), in shares of width and height, of each line."""
     lines = [(f"{path}, line {i}", line.split()) for i, line in enumerate(place.text(path).splitlines(), 1)]
-    are_boxes = all(len(words) <= 2 + _BOX for _, words in lines)  # With a confidence, or without.
+    are_boxes = all(_numbers(words, tracked) <= _BOX for _, words in lines)
     found = []
     for where, words in lines:
         if not words:
@@ -73,7 +93,7 @@ def _lines(place: Place, path: Path) -> list[tuple[int, npt.NDArray[np.float64]]
         if values is None or not re.fullmatch(r"[0-9]{1,5}", words[0]):
             line = quoted(" ".join(words)[:60])
             raise MaskFormatError(f"{where}: is {line}; expected a class and pairs x y from 0 to 1")
-        values = values[: len(values) // 2 * 2]
+        values = values[: _numbers(words, tracked)]
         if are_boxes and len(values) == _BOX:
             raise MaskFormatError(f"{where}: is a box; expected a class and the points of an outline")
         if not (np.abs(values - 0.5) <= 1).all():
@@ -81,6 +101,12 @@ def _lines(place: Place, path: Path) -> list[tuple[int, npt.NDArray[np.float64]]
             raise MaskFormatError(f"{where}: has the coordinate {odd:g}; expected shares of the image, from 0 to 1")
         found.append((check_id(int(words[0]), where) + 1, values.reshape(-1, 2)))
     return found
+
+
+def _numbers(words: list[str], tracked: bool) -> int:
+    """Count the numbers of a line that are of points: all but an odd last one, or a confidence and an id."""
+    count = len(words) - 1
+    return count - (count % 2 or 2 * tracked)
 
 
 def _names(place: Place) -> dict[int, str] | None:
