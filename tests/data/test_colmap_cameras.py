@@ -65,6 +65,14 @@ def test_colmap_images_of_one_stem_are_named_after_their_folders(tmp_path: Path)
     assert [camera.name for camera in read_cameras(tmp_path)] == ["left_1", "right_1", "right_2"]
 
 
+@pytest.mark.parametrize("text", [False, True], ids=["bin", "txt"])
+def test_colmap_images_keep_the_spaces_in_their_names(tmp_path: Path, text: bool) -> None:
+    write_colmap(tmp_path / "sparse" / "0", ("room/0001.jpg", "Küche hinten/photo 2 (1).JPG"), text=text)
+    first, second = read_cameras(tmp_path)
+    assert_lands(first, 55, 35)
+    assert second.name == "photo 2 (1)"
+
+
 def test_colmap_images_of_one_name_after_their_folders_too_are_refused(tmp_path: Path) -> None:
     write_colmap(tmp_path / "sparse" / "0", ("a/b_1.jpg", "a_b/1.jpg", "c/1.jpg"))
     assert_refused(tmp_path, CameraFileError, "2 images have the stem 'a_b_1'")

@@ -6,6 +6,7 @@ import os
 import shutil
 import struct
 import tempfile
+from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, BinaryIO
 
@@ -21,7 +22,9 @@ from gsseg_core.text import clipped
 if TYPE_CHECKING:
     import pycolmap
 
+_Copy = Callable[[BinaryIO, BinaryIO], None]
 _LEAST_CAMERA = 40  # bytes of a camera in a binary model, of one with two parameters
+_SPACE = "\x1f"  # stands for a space in a name while pycolmap reads it
 
 
 def read_colmap(path: Path, within: Path | None) -> list[Camera]:
@@ -30,7 +33,7 @@ def read_colmap(path: Path, within: Path | None) -> list[Camera]:
     cameras = []
     for image_id, image in sorted(model.images.items()):
         try:
-            name = image.name
+            name = image.name.replace(_SPACE, " ")
         except UnicodeDecodeError as error:
             raise CameraFileError(f"{path}, image {image_id}: its name is not UTF-8 text") from error
         where = f"{path}, image '{clipped(name)}'"
@@ -74,10 +77,13 @@ def _load(path: Path, within: Path | None) -> pycolmap.Reconstruction:
         raise CameraFileError(f"{path}: COLMAP model has {cameras.name} but no {images.name}")
     with tempfile.TemporaryDirectory() as folder:
         # What was checked is what pycolmap reads, so it gets a copy.
-        for file, copy in ((cameras, _copy_cameras), (images, _copy_images)):
+        copies: list[_Copy] = [_copy_cameras, _copy_images]
+        if suffix == ".txt":
+            copies = [shutil.copyfileobj, _copy_images_of_text]
+        for file, copy in zip((cameras, images), copies, strict=True):
             try:
                 with open_input(file, within) as source, open(Path(folder) / file.name, "wb") as target:
-                    (copy if suffix == ".bin" else shutil.copyfileobj)(source, target)
+                    copy(source, target)
             except OSError as error:
                 raise CameraFileError(f"{file}: cannot be read ({reason(error)})") from error
             except (struct.error, ValueError) as error:
@@ -121,3 +127,15 @@ def _copy_images(source: BinaryIO, target: BinaryIO) -> None:
             raise ValueError(f"{points} points")
         source.seek(24 * points, os.SEEK_CUR)
         target.write(pose + bytes(name) + bytes(9))
+
+
+def _copy_images_of_text(source: BinaryIO, target: BinaryIO) -> None:
+    """Copy a list of images in text, each in two lines; spaces in names are replaced, as pycolmap would end them there.
+
+    COLMAP itself writes such names.
+    """
+    for line in source:
+        if (image := line.strip()) and not image.startswith(b"#"):
+            *pose, name = image.split(b" ", 9)
+            line = b" ".join([*pose, name.replace(b" ", _SPACE.encode())]) + b"\n" + next(source, b"")
+        target.write(line)
