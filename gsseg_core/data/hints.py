@@ -71,7 +71,11 @@ def mask_hint(root: Path, labels: str, stems: Collection[str]) -> str:
         wrong = f"{labels}/ has a folder for each class, such as {classes[0].name}/"
         return f"{looked}, but {wrong}: make one for each view, {labels}/{stem}/<class id>.png ({_MORE})"
     others = [path for path in (*_folders(root), *_annotations(root)) if path != root / labels]
-    counts = [(len(_masks(mask_files, path, stems)) or _count_foreign(path, stems), path) for path in others]
+    below_it = [_DEPTH - len(path.relative_to(root).parts) for path in others]
+    counts = [
+        (len(_masks(mask_files, path, stems)) or _count_foreign(path, stems, depth), path)
+        for path, depth in zip(others, below_it, strict=True)
+    ]
     # A folder that was named may be one too high; what lies beside it is perhaps something else, as true masks are.
     below = (root / labels).resolve()
     count, place = max(
@@ -138,10 +142,10 @@ def _masks(finder: Callable[..., dict[str, Path]], folder: Path, stems: Collecti
     return []
 
 
-def _count_foreign(place: Path, stems: Collection[str]) -> int:
-    """Count the masks of the given stems that another program wrote."""
+def _count_foreign(place: Path, stems: Collection[str], depth: int) -> int:
+    """Count the masks of the given stems that another program wrote, in folders of so many levels at most."""
     with suppress(GssegError, OSError):
-        masks = open_masks(place, stems)
+        masks = open_masks(place, stems, depth=depth)
         return 0 if masks is None else len(masks.views)
     return 0
 

@@ -13,10 +13,10 @@ from pathlib import Path
 import numpy as np
 import numpy.typing as npt
 
-from gsseg_core.data.mask_formats.place import view_of
+from gsseg_core.data.mask_formats.place import view_of, views_below
 from gsseg_core.data.soft_masks import SeenLabels, check_forms, combine_detections, quantise
 from gsseg_core.errors import MaskFormatError, SupervisesFileError, UnknownLabelError
-from gsseg_core.files.input_files import check_pixels, is_there, list_below, list_folder, open_image
+from gsseg_core.files.input_files import check_pixels, is_there, list_folder, open_image
 from gsseg_core.files.json_files import read_object
 from gsseg_core.files.limits import MAX_LABEL
 from gsseg_core.files.npz_files import NpzArrays, open_arrays
@@ -54,21 +54,9 @@ def mask_files(folder: Path, stems: Iterable[str], within: Path | None = None) -
 
 
 def masks_below(folder: Path, stems: Iterable[str], within: Path | None = None) -> dict[str, Path]:
-    """Find the masks of views, by `mask_files`, or, where there is none, in folders as their images are: `left/1.png`.
-
-    Where a view has several of those, they are something else, one for each class perhaps, and there is none.
-    """
+    """Find the masks of views, by `mask_files`, or, where there is none, by `views_below`."""
     wanted = set(stems)
-    found = mask_files(folder, wanted, within)
-    if found:
-        return found
-    for path in list_below(folder, MaskFormatError, within):
-        view = view_of(str(path.relative_to(folder)), wanted) if path.suffix.lower() in (".png", ".npz") else None
-        if view in found:
-            return {}
-        if view is not None:
-            found[view] = path
-    return found
+    return mask_files(folder, wanted, within) or views_below(folder, wanted, (".png", ".npz"), within)
 
 
 def _add(found: dict[str, Path], stem: str, path: Path) -> None:

@@ -166,11 +166,11 @@ def test_soft_masks_in_a_folder_of_another_name_are_found_as_plain_ones_are(
 def test_masks_below_the_folder_that_was_named_come_before_those_beside_it(
     data: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    (data / "yolo/labels").mkdir(parents=True)
+    (data / "coco/annotations").mkdir(parents=True)
     (data / "labels").rename(data / "true")
-    for path in sorted((data / "true").iterdir())[:-1]:
-        (data / f"yolo/labels/{path.stem}.txt").write_text("0 0 0 0.5 0 0.5 1 0 1\n")
-    assert typed(error_of(capsys, data, "--labels", "yolo"), "--labels") == ["yolo/labels"]
+    images = {path.stem: np.array(Image.open(path)) for path in sorted((data / "true").iterdir())[:-1]}
+    mask_writers.coco(data / "coco/annotations", images, {1: "mug", 2: "cup", 3: "box"})
+    assert typed(error_of(capsys, data, "--labels", "coco"), "--labels") == ["coco/annotations"]
     assert typed(error_of(capsys, data), "--labels") == ["true"]
 
 

@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Collection, Iterator
+from collections.abc import Collection, Iterable, Iterator
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path, PureWindowsPath
 
 from gsseg_core.errors import MaskFormatError
-from gsseg_core.files.input_files import IMAGE_SUFFIXES, list_folder, read_input
+from gsseg_core.files.input_files import IMAGE_SUFFIXES, list_below, list_folder, read_input
 from gsseg_core.files.json_files import read_json
 from gsseg_core.text import composed
 
@@ -48,6 +48,23 @@ def possible_stems(name: str) -> list[str]:
     return ["_".join(parts[-count:]) for count in range(1, min(len(parts), 1 + _FOLDERS) + 1)]
 
 
+def views_below(
+    folder: Path, stems: Collection[str], suffixes: Iterable[str], within: Path | None, depth: int = _FOLDERS
+) -> dict[str, Path]:
+    """Find the files that belong to views in folders as their images are, `depth` levels down: `left/1.png`.
+
+    Where a view has several of those, they are something else, one for each class perhaps, and there is none.
+    """
+    found: dict[str, Path] = {}
+    for path in list_below(folder, MaskFormatError, within, depth):
+        view = view_of(str(path.relative_to(folder)), stems) if path.suffix.lower() in suffixes else None
+        if view in found:
+            return {}
+        if view is not None:
+            found[view] = path
+    return found
+
+
 @dataclass(frozen=True, eq=False)
 class Place:
     """The file or folder that `--labels` names; it and all below must lie in `within`, if that is given."""
@@ -55,6 +72,7 @@ class Place:
     path: Path
     stems: frozenset[str]
     within: Path | None = None
+    depth: int = _FOLDERS  # of folders in it that may hold masks of views
     unmatched: list[str] = field(default_factory=list)  # names that belong to no view, for messages
 
     @cached_property
@@ -77,13 +95,22 @@ class Place:
     def by_view(self, suffix: str) -> dict[str, Path]:
         """Find the files with a suffix that belong to a view, by view: those in a folder, or the file itself.
 
-        If the place is a file and there is one view only, it belongs to that view, whatever its name. Raises
-        `MaskFormatError` where a view has two.
+        In a folder of folders alone, as images may lie, they are those of `views_below`. If the place is a file and
+        there is one view only, it belongs to that view, whatever its name. Raises `MaskFormatError` where a view has
+        two.
         """
         files = [path for path in self.entries or [self.path] if path.suffix.lower() == suffix and not path.is_dir()]
         if len(self.stems) == 1 and files == [self.path]:
             return dict.fromkeys(self.stems, self.path)
-        return self.views((path.name, path) for path in files)
+        if self._has_masks:
+            return self.views((path.name, path) for path in files)
+        return views_below(self.path, self.stems, (suffix,), self.within, self.depth)
+
+    @cached_property
+    def _has_masks(self) -> bool:
+        """Whether masks are in it itself: something that is called after a view, or one file for all views."""
+        of_views = any(view_of(path.name, self.stems) for path in self.entries)
+        return of_views or not self.entries or any(self.only(suffix) for suffix in (".json", ".xml"))
 
     def views(self, named: Iterator[tuple[str, Path]]) -> dict[str, Path]:
         """Find the views that names belong to; raises as `by_view` does."""

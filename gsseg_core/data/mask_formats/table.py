@@ -12,7 +12,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 from gsseg_core.data.label_images import mask_header
-from gsseg_core.data.mask_files import CLASS_ID, DETECTIONS, mask_files
+from gsseg_core.data.mask_files import CLASS_ID, DETECTIONS, mask_files, masks_below
 from gsseg_core.data.mask_formats.coco import is_coco, read_coco
 from gsseg_core.data.mask_formats.cvat import is_cvat, read_cvat
 from gsseg_core.data.mask_formats.eiseg import is_eiseg, read_eiseg
@@ -93,19 +93,24 @@ MASK_FORMATS = [
 """All formats; a new one is added here."""
 
 
-def open_masks(path: Path, stems: Iterable[str], within: Path | None = None) -> MaskSet | None:
+def open_masks(
+    path: Path, stems: Iterable[str], within: Path | None = None, depth: int = Place.depth
+) -> MaskSet | None:
     """Open the masks of another program, recognised by what they hold; None for gsseg's own, or where there are none.
+
+    Files of views may lie in folders as their images do, `depth` levels down.
 
     Raises `MaskFormatError` where they are of no known format, or may be of several, are broken, or of no view;
     `PathNotAllowedError` where they lie outside `within`; `SettingsError` where a library is needed and not installed.
     """
-    place = Place(path, frozenset(stems), within)
+    place = Place(path, frozenset(stems), within, depth)
     try:
         if not path.exists():
             return None
         found = [known for known in MASK_FORMATS if known.recognise(place)]
         names = [known.name for known in found]
-        own = mask_files(path, place.stems, within).values() if found and "EISeg" not in names else ()
+        find = mask_files if "SAM 2 video" in names else masks_below  # Its folders are of objects.
+        own = find(path, place.stems, within).values() if found and "EISeg" not in names else ()
         if any(_is_own(file, place) for file in own):  # Photos beside annotations are none.
             names.append(LABEL_IMAGES)
         if len(names) > 1:
@@ -143,7 +148,7 @@ def _unknown(place: Place) -> Path | None:
     if not place.path.is_dir():
         return place.path
     described = next(iter([*place.by_view(".json").values(), *place.by_view(".txt").values()]), None)
-    return None if mask_files(place.path, place.stems, place.within) else described
+    return None if described is None or masks_below(place.path, place.stems, place.within) else described
 
 
 def _is_own(path: Path, place: Place) -> bool:
