@@ -156,17 +156,24 @@ def examine_scene(path: str) -> list[Finding]:
 
 
 def examine_dataset(path: str, labels: str) -> list[Finding]:
-    """Read the cameras and all masks of a dataset, and say what is there; nothing of a path without cameras.
+    """Read the cameras and all masks of a dataset, and say what is there; nothing of a scene.
 
-    Raises what `Dataset` and `View.read_seen` raise.
+    Raises what `Dataset` and `View.read_seen` raise, with where a scene lies in a folder that has no cameras.
     """
-    from gsseg_core.data.camera_files import find_cameras
+    from gsseg_core.data.camera_files import find_cameras, read_cameras
     from gsseg_core.data.dataset import Dataset
     from gsseg_core.data.hints import mask_hint
+    from gsseg_core.errors import CameraFileError
+    from gsseg_core.scene.scene_formats import find_format, scene_hint
     from gsseg_core.text import clipped, counted, masks_line
 
     found = find_cameras(Path(path)) if os.path.isdir(path) else None
     if found is None:
+        if os.path.isdir(path) and find_format(Path(path)) is None:
+            try:
+                read_cameras(path)
+            except CameraFileError as error:
+                raise CameraFileError(f"{error}{scene_hint(Path(path))}") from error
         return []
     dataset, name = Dataset(path, labels), clipped(path)
     masked = [view for view in dataset.views() if view.has_mask]

@@ -24,6 +24,7 @@ from gsseg_core.files.input_files import READABLE_IMAGES
 _FOREIGN_CAMERAS = {
     "transforms_train.json": "its cameras are nerfstudio's: copy it to transforms.json, with the image size as w and h",
     "poses_bounds.npy": "it is LLFF's: run nerfstudio's ns-process-data, or COLMAP, on the photos",
+    "mesh_info.json": "it is Polycam's raw data: run nerfstudio's ns-process-data polycam on it",
     "database.db": "it is COLMAP's database without a model: run `colmap mapper`, and give the folder with its sparse/",
 }
 FRAME_HINT = (

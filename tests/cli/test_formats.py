@@ -143,3 +143,19 @@ def test_a_scene_of_another_format_is_segmented_as_its_ply_is(tmp_path: Path) ->
         arguments = ["--segmentation", f"{tmp_path}/segmentation.npz", "--class", "1", "--out", f"{tmp_path}/rest.ply"]
         assert main(["remove", f"{tmp_path}/scene.{name}", *arguments]) == 0
         np.testing.assert_array_equal(GaussianScene.load(tmp_path / "rest.ply").means, read.means[result.labels != 1])
+
+
+def test_doctor_says_of_a_folder_without_cameras_what_lies_there_and_where_a_scene_is(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / "capture").mkdir()
+    (tmp_path / "capture/transforms_train.json").touch()
+    assert main(["doctor", str(tmp_path / "capture")]) == 2
+    told = capsys.readouterr().err
+    assert "has no cameras; looked for cameras.json" in told and "found transforms_train.json" in told
+    assert told.endswith("; no scene lies in it\n")
+    write_dataset(tmp_path / "trained")
+    (tmp_path / "trained/cameras.json").unlink()
+    assert main(["doctor", str(tmp_path / "trained")]) == 2
+    told = capsys.readouterr().err
+    assert "has no cameras" in told and told.endswith(f"; type {tmp_path}/trained/scene.ply\n")

@@ -224,7 +224,12 @@ def test_cameras_above_or_beside_a_wrong_data_folder_are_found(data: Path) -> No
 
 @pytest.mark.parametrize(
     ("name", "told"),
-    [("transforms_train.json", "copy it to transforms.json"), ("poses_bounds.npy", "LLFF"), ("database.db", "mapper")],
+    [
+        ("transforms_train.json", "copy it to transforms.json"),
+        ("poses_bounds.npy", "LLFF"),
+        ("database.db", "mapper"),
+        ("mesh_info.json", "ns-process-data polycam"),
+    ],
 )
 def test_cameras_of_other_programs_are_recognised(tmp_path: Path, name: str, told: str) -> None:
     (tmp_path / "capture").mkdir()
