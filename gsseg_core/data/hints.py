@@ -101,7 +101,10 @@ def mask_hint(root: Path, labels: str, stems: Collection[str]) -> str:
     if found[0].is_file() and found[0].suffix.lower() not in (".png", ".npz"):
         expected = f"label images as PNG, and probabilities as {stem}.npz or {stem}/<class id>.tif ({_MORE})"
         return f"{looked}, but {labels}/ holds files such as {found[0].name}; expected {expected}"
-    return f"{looked}, but {labels}/ holds names such as {found[0].name}: rename them to the names of the images"
+    wrong = f"{looked}, but {labels}/ holds names such as {found[0].name}"
+    if sum(path.stem.startswith((f"{stem}_", f"{stem}-")) for path in found) > 1:
+        return f"{wrong}, several of a view: make a folder for each view, {labels}/{stem}/<class id>.png ({_MORE})"
+    return f"{wrong}: rename them to the names of the images"
 
 
 def _has_cameras(folder: Path) -> bool:

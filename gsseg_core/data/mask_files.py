@@ -114,7 +114,10 @@ def read_soft_mask(
     with open_arrays(path, "an npz with probabilities (K, H, W)", MaskFormatError, within) as arrays:
         if "probabilities" not in arrays.names:
             found = clipped(", ".join(arrays.names)) or "nothing"
-            raise MaskFormatError(f"{path}: holds {found}; expected an array 'probabilities'")
+            raise MaskFormatError(
+                f"{path}: holds {found}; expected an array 'probabilities'; labels, one for each pixel, are PNGs "
+                "(gsseg_core.data.label_images.write_mask)"
+            )
         _check_claims(path, arrays, class_names, camera)
         probabilities = arrays.read("probabilities")
         classes, unknown = (arrays.read(name) if name in arrays.names else None for name in ("classes", _UNKNOWN))

@@ -109,6 +109,12 @@ def other_detections(data: Path) -> None:
         path.rename(data / f"labels/{path.stem}_objects/1.png")
 
 
+def one_for_each_object(data: Path) -> None:
+    for path in list((data / "labels").iterdir()):
+        shutil.copy(path, data / f"labels/{path.stem}_1.png")
+        path.rename(data / f"labels/{path.stem}_2.png")
+
+
 def emptied(data: Path) -> None:
     shutil.rmtree(data / "labels")
     (data / "labels").mkdir()
@@ -122,6 +128,7 @@ def emptied(data: Path) -> None:
         (other_files, "labels/ holds files such as view0.tif; expected label images as PNG, and probabilities as view"),
         (by_class, "labels/ has a folder for each class, such as 1/: make one for each view, labels/view"),
         (other_detections, "labels/ holds names such as view0_objects: rename them"),
+        (one_for_each_object, "view0_1.png, several of a view: make a folder for each view, labels/view0/"),
         (emptied, "labels/ holds no mask"),
         (a_broken_link, "labels is a link to ../unmounted, which does not exist"),
         (lambda data: shutil.rmtree(data / "labels"), "there is no folder labels/"),

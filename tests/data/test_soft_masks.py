@@ -293,7 +293,7 @@ FULL = np.full((NUM_CLASSES, HEIGHT, WIDTH), 1 / NUM_CLASSES, np.float32)
 @pytest.mark.parametrize(
     ("arrays", "error", "message"),
     [
-        ({"logits": FULL}, MaskFormatError, "holds logits; expected an array 'probabilities'"),
+        ({"logits": FULL}, MaskFormatError, "holds logits; expected an array 'probabilities'; labels, one for each"),
         ({"probabilities": FULL[:2]}, UnknownLabelError, "of 2 classes; expected 4"),
         ({"probabilities": FULL, "classes": np.arange(3)}, UnknownLabelError, "expected 4 ids"),
         ({"probabilities": FULL, "classes": np.arange(1, 5)}, UnknownLabelError, "labels 4"),
