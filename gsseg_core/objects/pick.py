@@ -48,6 +48,7 @@ from gsseg_core.text import quoted
 FORMAT = "gsseg-pick-1"
 
 FAR = 0.04  # px of evidence against the object for what lies as far from its middle as its Gaussians do on average
+_SHADES = (64, 191)  # of grey: edges that are soft have some as dark, and some as light
 GRAPH = GraphSettings(strength=4.0)  # one view says little of each Gaussian, so its neighbours say more than usual
 
 
@@ -162,8 +163,9 @@ def read_object_mask(
     Parameters
     ----------
     path : path
-        A label image, a PNG of ids; in one of black and white only, 255 is the object and not unknown. Or masks of
-        another program, see docs/formats.md; a file with the mask of one image may have any name.
+        A label image, a PNG of ids; in one of black and white only, soft edges or not, 255 is the object and not
+        unknown, and so is what is nearer to it. Or masks of another program, see docs/formats.md; a file with the mask
+        of one image may have any name.
     camera : Camera
         Of the view. The mask is drawn on the image as it was taken, of its size or the same larger or smaller.
     label : int or str, optional
@@ -208,14 +210,22 @@ def object_mask(labels: np.ndarray, label: int | None, source: str) -> np.ndarra
 
     `source` is what messages call the image.
     """
-    if label is None and not (labels > 0).any():
-        labels = np.where(labels == UNKNOWN, 1, labels)
+    if label is None and _is_black_and_white(labels):
+        labels = ((labels == UNKNOWN) | (labels > 127)).astype(np.int32)
     chosen = labels > 0 if label is None else labels == label
     if not chosen.any():
         there = listed(map(str, np.unique(labels[labels != UNKNOWN]).tolist()))
         wanted = "a label above 0" if label is None else f"the label {label}"
         raise MaskFormatError(f"{source}: holds the labels {there}; expected pixels with {wanted}")
     return np.where(chosen, 1, np.where(labels == UNKNOWN, UNKNOWN, 0)).astype(np.int32)
+
+
+def _is_black_and_white(labels: np.ndarray) -> bool:  # (H, W) int
+    """Whether an image has no ids, but white, which was read as unknown, and at most as much grey of all shades."""
+    grey = labels[labels > 0]
+    dark, light = _SHADES
+    has_shades = grey.size == 0 or (grey.min() <= dark and light <= grey.max() < 255)
+    return bool(has_shades and grey.size <= np.count_nonzero(labels == UNKNOWN))
 
 
 def _distance(means: np.ndarray, votes: np.ndarray) -> np.ndarray:

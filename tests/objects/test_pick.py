@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 import small_scenes
 from mask_writers import PER_VIEW_WRITERS, WRITERS
+from PIL import Image
 from small_scenes import NAMES
 
 from gsseg_core.cli.main import main
@@ -139,6 +140,18 @@ def test_drawn_masks_are_read_black_and_white_or_by_label(tmp_path: Path) -> Non
         read_object_mask(tmp_path / "labels.png", small, "cup", {3: "cup", 5: "cup"})
     with pytest.raises(MaskSizeError, match="for an image of 4 x 1 pixels"):
         read_object_mask(tmp_path / "labels.png", CAMERA)
+
+
+def test_of_a_black_and_white_mask_with_soft_edges_the_white_is_the_object(tmp_path: Path) -> None:
+    camera = Camera("soft", 64, 48, np.eye(3), np.eye(4))
+    rows, columns = np.mgrid[:96, :128]
+    disc = ((rows - 40) ** 2 + (columns - 70) ** 2 < 24**2).reshape(48, 2, 64, 2).mean(axis=(1, 3))
+    Image.fromarray(np.rint(255 * disc).astype(np.uint8)).save(tmp_path / "soft.png")
+    np.testing.assert_array_equal(read_object_mask(tmp_path / "soft.png", camera), disc >= 0.5)
+    # Ids beside much that is unknown stay ids.
+    labels = np.where(disc == 1, 254, np.where(disc > 0, 80, -1))
+    write_mask(tmp_path / "ids.png", labels, 8)
+    np.testing.assert_array_equal(read_object_mask(tmp_path / "ids.png", camera), np.where(disc > 0, 1, -1))
 
 
 @pytest.mark.parametrize("name", [*WRITERS, *PER_VIEW_WRITERS])
