@@ -23,6 +23,9 @@ ASK_SECONDS = 2.0
 CANCEL_SECONDS = 5.0
 """How long a goal that is given up may take to end."""
 
+SILENT_SECONDS = 10.0
+"""Without news of a goal until its result is asked for again: a node that was started anew knows of no goal."""
+
 
 class Calls:
     """Calls services of one node."""
@@ -105,6 +108,7 @@ class LearnGoal:
         self._calls, self._action, self._goal = calls, action, goal
         self._feedback: deque[Any] = deque()
         self._accepting: Any = None
+        self._questions: list[Any] = []  # for its result
         self._cancel_asked = self._cancel_sent = False
 
     def cancel(self) -> None:
@@ -122,21 +126,42 @@ class LearnGoal:
                 self._accepting = None  # There is nothing to give up.
                 why = f"{self._calls.node_name} rejected the goal: it is not active"
                 raise SegmentationError(Learn.Result.NOT_ACTIVE, "NOT_ACTIVE", why)
-            result = self._calls.spinner.run(handle.get_result_async)
-            while self._feedback or not result.done():
-                self._settle(lambda: result.done() or self._feedback or self._to_be_canceled, deadline)
+            self._ask(handle)
+            while self._feedback or not self._answers:
+                self._await_news(deadline)
+                if not self._has_news:
+                    self._ask(handle)
                 if self._to_be_canceled:
                     self._cancel_sent = True
                     self._calls.spinner.run(handle.cancel_goal_async)
                 self._tell(on_feedback)
+            answer = self._answers[0]
+            if not answer.status:  # It is unknown: the node was started anew, and has no such goal.
+                raise self._calls.unanswered("learn", gone=True)
         except BaseException:
             self._give_up()
             raise
-        return checked(result.result().result)
+        return checked(answer.result)
+
+    @property
+    def _answers(self) -> list[Any]:
+        return [question.result() for question in self._questions if question.done()]
 
     @property
     def _to_be_canceled(self) -> bool:
         return self._cancel_asked and not self._cancel_sent
+
+    @property
+    def _has_news(self) -> bool:
+        return bool(self._feedback or self._answers or self._to_be_canceled)
+
+    def _ask(self, handle: Any) -> None:
+        self._questions.append(self._calls.spinner.run(handle.get_result_async))
+
+    def _await_news(self, deadline: float) -> None:
+        """Wait for news, or until it is time to ask again."""
+        latest = time.monotonic() + SILENT_SECONDS
+        self._settle(lambda: self._has_news or time.monotonic() >= latest, deadline)
 
     def _send(self) -> None:
         self._accepting = self._action.send_goal_async(

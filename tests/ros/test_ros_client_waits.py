@@ -42,7 +42,7 @@ from gsseg_msgs.srv import Reset
 from sensor_msgs.msg import PointCloud2
 from std_msgs.msg import Header
 
-from gsseg_ros.client import NodeUnavailableError, SegmentationClient, SegmentationError
+from gsseg_ros.client import NodeUnavailableError, SegmentationClient, SegmentationError, calls
 from gsseg_ros.client.calls import Calls
 from gsseg_ros.client.run_clouds import RunClouds
 
@@ -240,6 +240,25 @@ def test_a_node_that_is_asked_to_end_cancels_learning_and_says_so(ros: Ros, tmp_
         running.join()
         assert isinstance(running.error, SegmentationError), (running.error, node.output)
         assert running.error.name == "CANCELED" and node.wait() == 0
+
+
+def test_learning_ends_with_an_error_where_the_node_was_killed_and_started_anew_meanwhile(
+    ros: Ros, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(calls, "SILENT_SECONDS", 0.02)  # Less than lies between two messages of feedback.
+    write_dataset(tmp_path / "data")
+    node = start_node(ros, tmp_path)
+    with SegmentationClient(domain_id=ros.domain, find_timeout=PATIENCE) as client:
+        client.wait_until_active(PATIENCE)
+        running = learning_forever(client)
+        time.sleep(2.0)  # While it works, to be asked again does not disturb it.
+        assert not running.ended
+        node.kill()
+        start_node(ros, tmp_path)
+        running.join()
+        assert isinstance(running.error, NodeUnavailableError), running.error
+        assert "/gsseg went away during learn" in str(running.error)
+        assert client.learn("data", timeout=PATIENCE).report.num_views == 4
 
 
 def test_a_service_that_goes_away_unanswered_ends_the_wait(ros: Ros) -> None:
