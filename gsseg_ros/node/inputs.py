@@ -171,7 +171,7 @@ class Inputs:
         self.arrivals[topic], self.roles[topic] = (0, self.started), "detections"
         return DetectionsInput(
             self._node,
-            topic,
+            name,
             lambda kind, take: self._listen(None, kind, "detections", name, take),
             lambda take: self._listen(None, mask_class(settings), "mask", camera.topic("mask"), take),
             camera.on_mask,

@@ -96,7 +96,8 @@ class MatchedSubscription:
 
     def _offered(self, quality: QoSProfile) -> tuple[ReliabilityPolicy, DurabilityPolicy]:
         """Find out what all publishers offer; reliable while there is none, so that of the first nothing is lost."""
-        offers = [info.qos_profile for info in self._node.get_publishers_info_by_topic(self.topic_name)]
+        # By the name before remapping, as rclpy remaps it here: of two exchanged topics it would find the other.
+        offers = [info.qos_profile for info in self._node.get_publishers_info_by_topic(self._topic)]
         reliability = quality.reliability
         if self._matches:
             reliable = all(offer.reliability == ReliabilityPolicy.RELIABLE for offer in offers)

@@ -130,7 +130,7 @@ class Graph:
     """Stands in for a node: knows of which types a topic is."""
 
     def __init__(self, *types: str) -> None:
-        self.types, self.gone = types, []
+        self.types, self.gone, self.resolve_topic_name = types, [], str
 
     def get_publishers_info_by_topic(self, topic: str) -> list[Any]:
         return [Fields(topic_type=name) for name in self.types]

@@ -15,14 +15,17 @@ from small_scenes import clean_views, lost_half_way
 
 pytest.importorskip("gsseg_msgs.msg", reason="gsseg_msgs is not installed")
 
+from geometry_msgs.msg import PoseStamped
 from gsseg_msgs.action import Learn
 from gsseg_msgs.msg import ObjectArray
 from nav_msgs.msg import Odometry
 from rclpy.action.server import GoalResponse
 from rclpy.parameter import Parameter
+from rclpy.qos import QoSProfile, ReliabilityPolicy
 from sensor_msgs.msg import PointCloud2
 
 from gsseg_ros.node import diagnostics, live_outputs, services
+from gsseg_ros.node.masks.detections import ADAPTERS, Adapter
 from gsseg_ros.node.reports import Selection
 
 SIDES = ("left", "right")
@@ -96,6 +99,25 @@ def test_topics_of_two_cameras_can_be_exchanged_by_remapping(ros: Ros, parameter
             assert images._subscription is not None
             heard = [images._subscription, detections._listen(PointCloud2, lambda topic, message: None)]
             assert [one._subscription.topic_name for one in heard] == [f"/{other}/image", f"/{other}/found"]
+
+
+def test_each_of_two_exchanged_topics_is_heard_as_its_own_publisher_offers(
+    ros: Ros, parameters: dict[str, Any], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    values = {**parameters, "cameras": list(SIDES), "detections_topic": "found", "ids": "given"}
+    rules = [f"{one}/{name}:={two}/{name}" for name in ("pose", "found") for one, two in (SIDES, SIDES[::-1])]
+    monkeypatch.setitem(ADAPTERS, "nav_msgs/msg/Odometry", Adapter("nav_msgs", "Odometry", False, ""))
+    ros.node.create_publisher(Odometry, "/left/found", 1)
+    for side, reliability in zip(SIDES, (ReliabilityPolicy.RELIABLE, ReliabilityPolicy.BEST_EFFORT), strict=True):
+        ros.node.create_publisher(PoseStamped, f"/{side}/pose", QoSProfile(depth=1, reliability=reliability))
+    with node_here(ros, values, rules) as here:
+
+        def heard() -> list[str]:
+            here.inputs._expire()
+            return [here.inputs.policies[f"/{side}/pose"] for side in SIDES]
+
+        wait_until(lambda: heard() == ["reliable, volatile", "best effort, volatile"], "each as it is offered")
+        wait_until(lambda: [one.adapter is None for one in here.inputs.detections] == [True, False], "the detections")
 
 
 def test_a_node_that_is_asked_again_and_again_what_it_cannot_answer_yet_says_so_once_in_its_log(

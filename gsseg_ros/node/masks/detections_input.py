@@ -22,7 +22,7 @@ _WAITING = 30  # Masks, and detections, that wait for each other.
 
 
 class DetectionsInput:
-    """Detections of one camera, on a topic by its full name; each goes on to `forward` once it is whole.
+    """Detections of one camera, on a topic by its name before remapping; each goes on to `forward` once it is whole.
 
     `listen` subscribes to them, once their type is known, and `listen_to_mask` to the masks that belong to them. `lost`
     is told why, and in which words, one went on without its other part.
@@ -37,7 +37,8 @@ class DetectionsInput:
         forward: Callable[[str, Detected], None],
         lost: Callable[[str, str], None],
     ) -> None:
-        self._node, self._topic, self._forward, self._lost = node, topic, forward, lost
+        self._node, self._name, self._forward, self._lost = node, topic, forward, lost
+        self._topic = node.resolve_topic_name(topic)
         self._listen, self._listen_to_mask = listen, listen_to_mask
         self.adapter: Adapter | None = None
         self._lock, self._closed = threading.Lock(), False
@@ -67,7 +68,7 @@ class DetectionsInput:
                 self._subscriptions.pop().close()
 
     def _look(self) -> str:
-        types = sorted({info.topic_type for info in self._node.get_publishers_info_by_topic(self._topic)})
+        types = sorted({info.topic_type for info in self._node.get_publishers_info_by_topic(self._name)})
         adapter = next((ADAPTERS[name] for name in types if name in ADAPTERS), None)
         if adapter is None:
             found = f"is of type {', '.join(types)}; expected {' or '.join(ADAPTERS)}"
