@@ -11,7 +11,8 @@ frames    the pose is that of the camera's optical frame (x right, y down, z for
 pixels    the image is rectified: d is all zeros, and k belongs to the rectified image at the size of the mask.
 labels    mono8 (255: unknown) or mono16 (65535: unknown), a class number per pixel, 0 for the background; never
           colours, never resized with interpolation.
-QoS       the segmentation node listens best effort, so any publisher fits. Reliable serves others, too.
+QoS       reliable: the segmentation node hears any publisher, but what a best-effort one loses, of large masks half, is
+          lost for good.
 """
 
 from __future__ import annotations
@@ -102,6 +103,8 @@ def main() -> None:
     parser.add_argument("dataset", metavar="DATASET", help="folder with cameras and labels/<stem>.png")
     parser.add_argument("--rate", type=float, default=5.0, help="masks per second (default: %(default)s)")
     options = parser.parse_args(remove_ros_args(sys.argv)[1:])
+    if not options.rate > 0:
+        parser.error(f"--rate is {options.rate:g}; expected more than 0 masks per second")
     try:
         views = [view for view in Dataset(options.dataset).views("train") if view.has_mask]
     except GssegError as error:

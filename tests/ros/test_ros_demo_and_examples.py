@@ -296,3 +296,8 @@ def test_examples_name_a_folder_that_is_not_there(example: str, tmp_path: Path) 
     arguments = [missing] if example == "publish_masks.py" else [missing, missing, str(tmp_path / "out")]
     ran = start_example(example, *arguments)
     assert ran.returncode == 1 and "nowhere" in ran.stderr and ran.stderr.count("\n") == 1
+
+
+def test_masks_at_a_rate_of_none_are_refused_in_one_line(tmp_path: Path) -> None:
+    ran = start_example("publish_masks.py", str(tmp_path), "--rate", "0")
+    assert ran.returncode == 2 and ran.stderr.endswith("--rate is 0; expected more than 0 masks per second\n")
