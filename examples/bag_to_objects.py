@@ -97,6 +97,9 @@ def main() -> None:
     try:
         scene = GaussianScene.load(options.scene)
         views = list(read_views(options.bag, topics, skipped))
+        for why, count in skipped.items():  # Before anything fails for want of them.
+            if count:
+                print(f"skipped {count} masks: {why}")
         labels = range(1 + max([len(options.class_names), *(view.largest_label for view in views)]))
         names = dict(zip(labels, ["background", *options.class_names], strict=False))
         learner = EMLearner(scene, len(labels))
@@ -108,9 +111,6 @@ def main() -> None:
         files = export_classes(scene, result, options.out)
     except (GssegError, AnyReaderError) as error:
         sys.exit(f"bag_to_objects: {error}")
-    for why, count in skipped.items():
-        if count:
-            print(f"skipped {count} masks: {why}")
     print(f"learnt from {len(views)} masks")
     for label, path in files.items():
         print(f"{path}: {(result.labels == label).sum()} Gaussians")

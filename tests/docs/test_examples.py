@@ -212,6 +212,10 @@ def test_a_bag_skips_what_cannot_be_used_and_names_a_topic_that_is_missing(tmp_p
     ran = run_example("bag_to_objects.py", scene, tmp_path / "bag", tmp_path / "out")
     assert "learnt from 2 masks" in ran.stdout and "skipped 1 masks: camera_info has distortion" in ran.stdout
     assert "skipped 1 masks: a pose has a quaternion of zeros" in ran.stdout
+    write_bag(tmp_path / "raw", views[:1], distorted=0)
+    ran = run_example("bag_to_objects.py", scene, tmp_path / "raw", tmp_path / "out")
+    assert ran.returncode == 1 and ran.stderr.startswith("bag_to_objects: no view to learn from")
+    assert ran.stdout.startswith("skipped 1 masks: camera_info has distortion")
     ran = run_example("bag_to_objects.py", scene, tmp_path / "bag", tmp_path / "out", "--mask", "/front/mask")
     assert ran.returncode == 1 and ran.stderr.count("\n") == 1
     assert "no topic /front/mask; topics in the bag: /camera_info, /mask, /pose" in ran.stderr
