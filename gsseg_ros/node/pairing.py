@@ -65,9 +65,10 @@ class Pairing:
 
     A camera_info belongs to a mask if it has its stamp and its frame_id, which names the camera; otherwise, once a
     later one of this camera has come or the waiting time is over, the newest earlier one does. That time is a second
-    where camera_infos do not come with each mask: where the one before went with an earlier one, too. A mask without a
-    frame_id goes with the only camera there is, a camera_info without one with every camera that has none of its own.
-    Every mask comes out of `take`, or is counted in `dropped`, or still waits.
+    where camera_infos do not come with each mask: where there is only one, as a latched one, or where the mask before
+    went with an earlier one, too. A mask without a frame_id goes with the only camera there is, a camera_info without
+    one with every camera that has none of its own. Every mask comes out of `take`, or is counted in `dropped`, or still
+    waits.
 
     A mask is given up when what belongs to it can be told not to come: its stream has gone on from the mask's stamp by
     a second, more than messages come out of order. While a stream is silent, masks wait within the limits of
@@ -309,8 +310,8 @@ class Pairing:
             return None
         if stamp in infos.values:
             return infos.values[stamp]
-        after, rare = bisect_left(infos.stamps, stamp), rare and not all(infos.found)
-        if after > 0 and (last_chance or rare or after < len(infos.stamps)):
+        after = bisect_left(infos.stamps, stamp)
+        if after > 0 and (last_chance or (rare and infos.rare) or after < len(infos.stamps)):
             return infos.values[infos.stamps[after - 1]]
         return None
 
@@ -348,6 +349,11 @@ class _CameraInfos(History[int, Any]):
     def __init__(self, capacity: int) -> None:
         super().__init__(capacity)
         self.found = deque([True, True], 2)
+
+    @property
+    def rare(self) -> bool:
+        """Whether there are fewer than masks, as far as is known."""
+        return len(self.stamps) == 1 or not all(self.found)
 
     def add(self, stamp: int, value: Any) -> None:
         """Keep a camera_info; of two with the same stamp the later one, as a driver may leave all stamps at zero."""

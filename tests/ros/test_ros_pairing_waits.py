@@ -51,12 +51,22 @@ def test_an_earlier_camera_info_does_not_serve_while_that_of_the_mask_may_be_lat
 def test_where_camera_infos_are_rare_only_the_first_mask_waits_for_long() -> None:
     pairing = Pairing(MessagePoses())
     stamps = [2 * S + i * 100 * MS for i in range(10)]
-    send(pairing, [("info", 1 * S), *((kind, stamp) for stamp in stamps for kind in ("pose", "mask"))])
+    infos = [("info", stamp) for stamp in (S // 2, 1 * S)]
+    send(pairing, [*infos, *((kind, stamp) for stamp in stamps for kind in ("pose", "mask"))])
     wait(pairing, 9.9)
     assert pairing.take() == []
     wait(pairing, 0.3)
     assert [p.stamp for p in pairing.take()] == stamps
     send(pairing, [("pose", 4 * S), ("mask", 4 * S)])
+    wait(pairing, 0.8)
+    assert pairing.take() == []
+    wait(pairing, 0.4)
+    assert [p.camera_info for p in pairing.take()] == [f"info {1 * S}"]
+
+
+def test_where_one_camera_info_is_all_that_has_come_no_mask_waits_for_long() -> None:
+    pairing = Pairing(MessagePoses())
+    send(pairing, [("info", 1 * S), ("pose", 2 * S), ("mask", 2 * S)])
     wait(pairing, 0.8)
     assert pairing.take() == []
     wait(pairing, 0.4)
