@@ -9,6 +9,7 @@ from __future__ import annotations
 import contextlib
 import os
 from collections.abc import Iterator, Mapping
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple, Protocol
 
@@ -84,7 +85,8 @@ class FolderSource:
                 f"{folder}: split '{split}' has no view; expected at least one "
                 f"(train has {len(dataset.views('train'))}, test has {len(dataset.views('test'))})"
             )
-        self._views = [view for view in views if view.has_mask]
+        # What ids are is for the receiver to say: those of a view's own are none of the classes.
+        self._views = [replace(view, class_names=None) for view in views if view.has_mask]
         # Names of those that are left out.
         self.without_mask = [view.name for view in views if not view.has_mask]
         if not self._views:

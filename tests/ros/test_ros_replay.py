@@ -175,6 +175,14 @@ def test_labels_of_sixteen_bits_arrive_bit_for_bit(ros: Ros, tmp_path: Path) -> 
     np.testing.assert_array_equal(labels_from_image(heard["mask"][0], "mask"), labels)
 
 
+def test_ids_that_are_none_of_the_classes_are_replayed_as_they_are(tmp_path: Path) -> None:
+    folder = write_dataset(tmp_path / "parts", names=NAMES)
+    ids = np.arange(64 * 48, dtype=np.int32).reshape(48, 64) % 40
+    write_mask(folder / "labels" / "view0.png", ids, 8)
+    (_, first), *_ = FolderSource(folder, "labels", "train", "camera", "map")
+    np.testing.assert_array_equal(labels_from_image(dict(first)["mask"], "mask"), ids)
+
+
 def test_a_loop_starts_again_with_later_stamps_and_no_mask_early(ros: Ros, folder: Path) -> None:
     heard = listen(ros)
     output = finished(ros.start("replay_node", {"data": folder, "rate": 20.0, "loop": 3}))
