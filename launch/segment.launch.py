@@ -34,6 +34,9 @@ ARGUMENTS = (
     ("rviz", "false", "whether to show what the node publishes in RViz: true or false"),
 )
 INPUTS = ("mask", "camera_info", "pose", "odometry", "image", "depth")
+# What the argument of a parameter is unless given, as a default would hide what params_file says: empty, unless that is
+# a value of its own.
+NOT_GIVEN = {"scene_frame": "(params_file)"}
 # Topics of the node that rviz/gsseg.rviz shows, below the name gsseg and relative to the namespace.
 SHOWN = ("cloud", "object_markers", "overlay")
 
@@ -41,9 +44,10 @@ SHOWN = ("cloud", "object_markers", "overlay")
 def generate_launch_description() -> LaunchDescription:
     """Declare the arguments; the node itself is put together once their values are known."""
     own = [DeclareLaunchArgument(name, default_value=value, description=text) for name, value, text in ARGUMENTS]
-    # Empty unless given: a default must not hide what params_file says.
     parameters = [
-        DeclareLaunchArgument(name, default_value="", description=f"parameter of the node, {value} by default")
+        DeclareLaunchArgument(
+            name, default_value=NOT_GIVEN.get(name, ""), description=f"parameter of the node, {value} by default"
+        )
         for name, value in _defaults().items()
     ]
     return LaunchDescription([*own, *parameters, OpaqueFunction(function=_nodes)])
@@ -76,7 +80,7 @@ def _nodes(context: LaunchContext) -> list[Node]:
     given = {
         name: ParameterValue(value[name], value_type=_type_of(default))
         for name, default in defaults.items()
-        if value[name]
+        if value[name] != NOT_GIVEN.get(name, "")
     }
     segment = Node(  # Not a LifecycleNode: it configures and activates itself, unless its parameter autostart is false.
         package="gsseg_ros",

@@ -111,6 +111,10 @@ def test_every_parameter_of_the_node_can_be_given_and_keeps_its_type(launched: L
     assert types == wanted
 
 
+def test_an_empty_scene_frame_is_given_to_the_node_too(launched: Launched) -> None:
+    assert launched(scene_frame="")[0].parameters[1]["scene_frame"].positional == ("",)
+
+
 @pytest.mark.parametrize(
     ("name", "namespace", "full"),
     [
