@@ -109,13 +109,13 @@ def run(options: argparse.Namespace) -> int:
 
 def _note_doubts(options: argparse.Namespace, report: dict[str, Any]) -> None:
     """Warn of what makes a whole run worthless."""
-    from gsseg_core.report.findings import NO_OBJECTS, has_objects, renamed_ids_of
+    from gsseg_core.report.findings import NO_OBJECTS, grey_ids_of, has_objects, renamed_ids_of
 
     known = [view["reliability"] for view in report["views"].get("reliability", ()) if view["reliability"] is not None]
     if known and median(known) < _HALF and report["settings"]["ids"] == "global":
         note(f"most masks contradict the others: {OWN_IDS}")
-    elif renamed := renamed_ids_of(report):
-        note(renamed)
+    elif of_ids := grey_ids_of(report) or renamed_ids_of(report):
+        note(of_ids)
     agreement = report["frame"]["agreement"]
     if agreement and not agreement["agrees"]:  # None where it is undecided.
         looks = "does not look" if agreement["agrees"] is False else "hardly looks"

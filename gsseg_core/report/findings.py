@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from gsseg_core.data.class_names import NOTED, listed
+from gsseg_core.data.class_names import NOTED, class_name, listed
 from gsseg_core.data.view import View
 from gsseg_core.learn.mask_reliability import ViewCheck, sum_cells
 from gsseg_core.learn.renamed_ids import renamed_note
@@ -19,6 +19,7 @@ SHOWN = 1 / 2000  # of its checked pixels a class has at least in a view that sh
 TRUSTED = 0.7  # the page warns of masks with which the other views agree in a smaller share of their pixels, ...
 KNOWN_CLASS = 0.5  # ... and of classes whose IoU with the masks is smaller than this
 FEW_VIEWS = 3
+_SHADES, _HARDLY_ANY = 32, 10  # so many ids of fewer Gaussians than that are shades of grey
 NO_OBJECTS = (
     "the masks name none, or contradict each other; expected ids from 1, as 0 is the background and 255 (in masks of "
     "16 bits 65535) unknown; detections of 8 bits are 0 to 255, not 0 and 1"
@@ -89,6 +90,19 @@ def has_objects(report: Mapping[str, Any]) -> bool:
     return any(entry["gaussians"] for entry in report["classes"] if entry["id"])
 
 
+def grey_ids_of(report: Mapping[str, Any]) -> str:
+    """Say in a sentence without its stop that ids look like shades of grey, and what to write; "" if they do not."""
+    unnamed = [entry for entry in report["classes"] if entry["id"] and entry["name"] == class_name({}, entry["id"])]
+    few = sum(entry["gaussians"] < _HARDLY_ANY for entry in unnamed)
+    if few < _SHADES or few < len(unnamed) / 2:
+        return ""
+    return (
+        f"{few} of the {len(unnamed)} ids in the masks got hardly a Gaussian: are these shades of grey, of masks that "
+        "were blurred, or resized other than by nearest pixel? An id is a whole number, 1 and not 255 for one object; "
+        "what lies between, a probability, is a soft mask (docs/masks.md)"
+    )
+
+
 def renamed_ids_of(report: Mapping[str, Any]) -> str:
     """Say in a sentence without its stop which ids name objects that have another, and what to do; "" if none does."""
     return renamed_note(report["views"].get("renamed", ()), "--ids per-view", "--label-map")
@@ -118,8 +132,8 @@ def warnings_of(report: Mapping[str, Any], ious: np.ndarray | None) -> list[str]
             f"{listed((view['name'] for view in doubtful), NOTED)}. Wrong ids, a wrong pose, or a mask of another "
             "image?"
         )
-    if renamed := renamed_ids_of(report):
-        warnings.append(f"{renamed[:1].upper()}{renamed[1:]}.")
+    if of_ids := grey_ids_of(report) or renamed_ids_of(report):
+        warnings.append(f"{of_ids[:1].upper()}{of_ids[1:]}.")
     names = dict(enumerate(entry["name"] for entry in report["classes"]))
     empty = [entry["name"] for entry in report["classes"] if entry["id"] and not entry["gaussians"]]
     if empty and report.get("ids"):

@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from PIL import Image
+from PIL import Image, ImageFilter
 from segmented_place import assert_one_line, segment
 from small_scenes import look_at, many_classes, write_dataset
 
@@ -214,6 +214,16 @@ def test_masks_without_an_object_work_from_end_to_end_and_that_is_said(
     assert "no Gaussian is part of an object: the masks name none" in capsys.readouterr().err
     assert "No Gaussian is part of an object: the masks name none" in (place / "out/report.html").read_text()
     assert [path.name for path in (place / "out/classes").iterdir()] == ["0_background.ply"]
+
+
+def test_masks_of_which_ids_are_shades_of_grey_are_said_to_be(place: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    (place / "data/classes.json").unlink()
+    for path in (place / "data/labels").iterdir():
+        white = Image.fromarray(np.where(np.array(Image.open(path)) == 1, 255, 0).astype(np.uint8))
+        white.filter(ImageFilter.GaussianBlur(2)).save(path)
+    assert main(segment(place)) == 0
+    assert "are these shades of grey, of masks that were blurred" in capsys.readouterr().err
+    assert "are these shades of grey" in (place / "out/report.html").read_text()
 
 
 @pytest.mark.parametrize("line", ["view s", "segment s --data d --out o", "render s --data d --out o --segmentation f"])
