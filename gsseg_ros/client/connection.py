@@ -36,6 +36,9 @@ _SERVICES = {
 POLL_SECONDS = 0.2
 """Until the node's state is asked for again."""
 
+SILENT_SECONDS = 5.0
+"""Of a node that says once a second how it is."""
+
 
 Self = TypeVar("Self", bound="Connection")
 
@@ -127,7 +130,7 @@ class Connection:
         self._spinner.run(self._hear_diagnostics)
         before = said = self._status
         while (news := self._status_after(said, deadline)) is not said:
-            said = news
+            said, heard = news, time.monotonic()
             values = {value.key: value.value for value in said.values}
             views = int(values.get("views fused", 0))
             if on_views is not None:
@@ -136,11 +139,12 @@ class Connection:
                 return views
         if said is before:
             raise self._calls.absent("its status on /diagnostics", timeout)
+        found = f"{self._name} has fused {views} of {count} views after {timeout:g} s"
+        if (silence := time.monotonic() - heard) > SILENT_SECONDS:
+            why = f"and has said nothing for the last {silence:.0f} s; check its log, and whether it still runs"
+            raise NodeUnavailableError(f"{found}, {why}")
         rejected = [f"{key}: {value}" for key, value in values.items() if key.startswith("rejected ")]
-        raise NodeUnavailableError(
-            f"{self._name} has fused {views} of {count} views after {timeout:g} s; it says: "
-            + "; ".join([said.message, *rejected])
-        )
+        raise NodeUnavailableError(f"{found}; it says: " + "; ".join([said.message, *rejected]))
 
     def _call(self, kind: Any, request: Any, timeout: float) -> Any:
         return self._calls.call(self._clients[kind], request, timeout)

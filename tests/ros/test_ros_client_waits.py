@@ -42,7 +42,7 @@ from gsseg_msgs.srv import Reset
 from sensor_msgs.msg import PointCloud2
 from std_msgs.msg import Header
 
-from gsseg_ros.client import NodeUnavailableError, SegmentationClient, SegmentationError, calls
+from gsseg_ros.client import NodeUnavailableError, SegmentationClient, SegmentationError, calls, connection
 from gsseg_ros.client.calls import Calls
 from gsseg_ros.client.run_clouds import RunClouds
 
@@ -197,6 +197,21 @@ def test_what_the_node_says_of_its_views_is_heard_by_every_thread_that_waits_for
         for wait in waits:
             wait.join()
             assert (wait.result, wait.error) == (3, None)
+
+
+def test_a_node_that_has_fallen_silent_is_not_said_to_fuse(ros: Ros, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(connection, "SILENT_SECONDS", 0.5)
+    with SegmentationClient(domain_id=ros.domain) as client:
+
+        def say() -> None:
+            status = DiagnosticStatus(name="/gsseg", message="fusing", values=[KeyValue(key="views fused", value="1")])
+            client._spinner.run(lambda: client._on_diagnostics(DiagnosticArray(status=[status])))
+
+        told: list[int] = []
+        waiting = Background(lambda: client.wait_for_views(3, 3.0, told.append))
+        wait_until(lambda: say() or told, "it to listen")  # type: ignore[func-returns-value]
+        waiting.join()
+    assert "has fused 1 of 3 views after 3 s, and has said nothing for the last " in str(waiting.error)
 
 
 def test_a_node_that_is_not_active_is_waited_for_and_its_state_named(ros: Ros, tmp_path: Path) -> None:
