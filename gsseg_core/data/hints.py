@@ -27,6 +27,7 @@ _FOREIGN_CAMERAS = {
     "mesh_info.json": "it is Polycam's raw data: run nerfstudio's ns-process-data polycam on it",
     "database.db": "it is COLMAP's database without a model: run `colmap mapper`, and give the folder with its sparse/",
 }
+_MODELS = (("cameras.bin", "images.bin"), ("cameras.txt", "images.txt"))  # COLMAP's, what is read of them
 FRAME_HINT = (
     "; cameras and scene may be in different frames: try --align, or gsseg doctor DATASET --scene SCENE. Or all of the "
     "scene is nearer to the cameras than 0.01 of its units, where nothing is drawn"
@@ -44,6 +45,9 @@ def camera_hint(folder: Path) -> str:
     if not folder.is_dir():
         near = [path for path in _subfolders(folder.parent) if _has_cameras(path)]
         return f"; {near[0]} has cameras: type --data {_quoted(near[0])}" if near else ""
+    if model := [files for files in _MODELS if all((folder / name).is_file() for name in files)]:
+        sparse, links = _quoted(folder / "sparse"), " ".join(f"../{name}" for name in model[0])
+        return f"; found COLMAP's {' and '.join(model[0])}: type mkdir {sparse} && ln -s {links} {sparse}"
     is_dataset = any((folder / name).is_dir() for name in ("labels", "images"))
     near = [path for path in [*_folders(folder), folder.parent] if _has_cameras(path)]
     if near and not is_dataset:

@@ -6,12 +6,14 @@ import errno
 import json
 import shlex
 import shutil
+import subprocess
 from collections.abc import Callable
 from pathlib import Path
 
 import mask_writers
 import numpy as np
 import pytest
+from camera_folders import write_colmap
 from PIL import Image
 from small_scenes import write_dataset
 
@@ -227,6 +229,15 @@ def test_a_dataset_below_the_folder_that_was_given_is_found(tmp_path: Path, file
 def test_cameras_above_or_beside_a_wrong_data_folder_are_found(data: Path) -> None:
     for wrong in (data / "labels", data / "scene.ply", data.parent / "dataa"):
         assert typed(camera_hint(wrong), "--data") == [str(data)]
+
+
+def test_a_colmap_model_in_the_folder_itself_is_linked_to_where_it_is_read(tmp_path: Path) -> None:
+    root = write_colmap(tmp_path / "from photos", text=True)
+    with pytest.raises(CameraFileError) as caught:
+        read_cameras(root)
+    command = str(caught.value).partition("found COLMAP's cameras.txt and images.txt: type ")[2]
+    subprocess.run(command, shell=True, check=True)
+    assert [camera.name for camera in read_cameras(root)] == ["0001"]
 
 
 @pytest.mark.parametrize(
