@@ -256,6 +256,15 @@ def test_images_of_detections_are_read_in_8_and_16_bits_and_float(tmp_path: Path
     np.testing.assert_array_equal(seen.evidence.supervised, [1, 2, 3])  # type: ignore[union-attr]
 
 
+def test_a_detection_that_its_tags_turn_is_refused(tmp_path: Path) -> None:
+    def write(labels: Path) -> None:
+        (labels / "view0").mkdir()
+        Image.fromarray(np.ones((HEIGHT, WIDTH), np.float32)).save(labels / "view0/3.tif", tiffinfo={0x0112: 3})
+
+    with pytest.raises(MaskFormatError, match=r"3\.tif: has the orientation 3 in its tags; expected 1, or none"):
+        dataset_with(tmp_path, write).read_seen()
+
+
 def test_supervises_json_tells_what_label_images_say_something_of(tmp_path: Path) -> None:
     write_dataset(tmp_path)
     for camera in ring(6):
