@@ -35,7 +35,7 @@ class PerViewSession(LiveSession):
     that has become part of another one is not given again. While it looks, for a few seconds, other calls wait.
 
     It is made like a `LiveSession`, but takes no `class_names`; a view that would make more objects than `max_classes`,
-    the background counted, is refused.
+    the background and those that ended in another one counted, is refused.
     """
 
     _LABEL, _REMEDY, _PER_VIEW = "would show the first of object", "", True
