@@ -7,11 +7,15 @@ write to none. So this module looks first; where there is no such folder, the ke
 from __future__ import annotations
 
 import os
+import pickle
 import sys
 import tempfile
 from pathlib import Path
 
 _PACKAGE = Path(__file__).resolve().parents[1]
+
+NOT_WHOLE = (EOFError, pickle.UnpicklingError)
+"""What reading raises of a file that was not on the disk when the power failed: for ever, unless it is flushed."""
 
 REMEDY = "set NUMBA_CACHE_DIR to a folder that you can write to"
 

@@ -8,7 +8,6 @@ loaded is its machine code; its bitcode is read when another that calls it is co
 
 from __future__ import annotations
 
-import pickle
 from collections.abc import Callable
 from contextlib import suppress
 from typing import Any
@@ -21,6 +20,7 @@ from numba.core.environment import Environment, lookup_environment
 from numba.core.runtime.nrt import rtsys
 from numba.np.ufunc.parallel import _launch_threads
 
+from gsseg_core.kernels.kernel_cache import NOT_WHOLE
 from gsseg_core.kernels.parts import taken_for
 from gsseg_core.kernels.stamps import stamp_of
 
@@ -110,11 +110,9 @@ class _KernelCache(FunctionCache):
         _launch_threads()
         try:
             return self._load_overload(sig, target_context)
-        except (AttributeError, ImportError):  # It was compiled for a type that has gone, or has another name, since.
+        except (AttributeError, ImportError, *NOT_WHOLE):  # Or it was compiled for a type that has gone since.
             self.flush()
-        except (EOFError, pickle.UnpicklingError):  # The power failed before the file was on the disk.
-            self.flush()
-        return None
+            return None
 
     def save_overload(self, sig: Any, data: Any) -> None:
         with suppress(OSError):  # Where the disk is full, the next run compiles it once more.

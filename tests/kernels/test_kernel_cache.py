@@ -33,6 +33,20 @@ import numpy as np
 from gsseg_core.learn.em.rejected_regions import connected_pixels
 print(connected_pixels(np.zeros((2, 2), np.int32))[1].tolist(), sum(connected_pixels.stats.cache_hits.values()))
 """
+# Without a GPU nothing is compiled: what its cache is asked for is all that there is of one.
+ONE_OF_THE_GPU = """
+from pathlib import Path
+from types import SimpleNamespace
+from gsseg_core.raster.gpu import device
+target = SimpleNamespace(refresh=lambda: None, codegen=lambda: SimpleNamespace(magic_tuple=lambda: ((8, 0),)))
+cache = device._try._cache
+index = Path(cache._cache_file._index_path)
+index.parent.mkdir(parents=True, exist_ok=True)
+def load(content):
+    index.write_bytes(content)
+    return cache.load_overload((), target)
+print(load(b""), load(bytes(100)), cache.load_overload((), target))
+"""
 FULL_DISK = """
 import errno, os
 def full(*_):
@@ -78,6 +92,11 @@ def test_a_kernel_that_is_not_whole_on_the_disk_is_compiled_anew_and_kept(tmp_pa
             done = run(environment, "-c", ONE_KERNEL)
             assert done.stdout == "[0] 0\n", done.stderr
     assert run(environment, "-c", ONE_KERNEL).stdout == "[0] 1\n"
+
+
+def test_a_kernel_of_the_gpu_that_is_not_whole_on_the_disk_is_compiled_anew(tmp_path: Path) -> None:
+    done = run({**os.environ, "NUMBA_CACHE_DIR": str(tmp_path)}, "-c", ONE_OF_THE_GPU)
+    assert done.stdout == "None None None\n", done.stderr
 
 
 def test_a_disk_too_full_to_keep_a_kernel_does_not_end_the_run(tmp_path: Path) -> None:

@@ -29,10 +29,25 @@ if not SIMULATED:
     # A small image starts few blocks, which nobody needs to be warned of.
     cuda.dispatcher.config.CUDA_LOW_OCCUPANCY_WARNINGS = 0
 
-_KEPT = {"cache": True} if kernel_cache.FOLDER and not SIMULATED else {}
+_KEPT = kernel_cache.FOLDER is not None and not SIMULATED
 
-gpu_kernel: Callable[..., Any] = functools.partial(cuda.jit, fastmath=True, **_KEPT)
-"""Compiles a kernel for the GPU, to be started by `launch`, and keeps it from one run to the next if that can be."""
+
+def gpu_kernel(function: Callable[..., Any]) -> Any:
+    """Compile a kernel for the GPU, to be started by `launch`, and keep it from one run to the next if that can be."""
+    made = cuda.jit(function, fastmath=True, cache=_KEPT)
+    if _KEPT:
+        made._cache.load_overload = functools.partial(_whole, made._cache, made._cache.load_overload)
+    return made
+
+
+def _whole(cache: Any, load: Callable[..., Any], *of_kernel: Any) -> Any:
+    """Load a kernel as numba does; None, so that it is compiled anew, where its file is not whole."""
+    try:
+        return load(*of_kernel)
+    except kernel_cache.NOT_WHOLE:
+        cache.flush()
+        return None
+
 
 called_by_kernels: Callable[..., Any] = functools.partial(cuda.jit, device=True, fastmath=True)
 
