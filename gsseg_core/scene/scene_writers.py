@@ -56,6 +56,8 @@ SCENE_WRITERS = {
 """Every format by the name that options have for it; the first is the default."""
 
 DEFAULT = next(iter(SCENE_WRITERS))
+# What is named so is taken for what it says, and is no PLY.
+_FOREIGN = (".usdz", ".obj", ".stl", ".fbx", ".dae", ".pcd", ".las", ".laz", ".e57")
 
 
 def check_format(name: str) -> None:
@@ -85,8 +87,8 @@ def writer_of(name: str) -> Any:
 def format_of(path: str | os.PathLike[str], asked: str | None = None) -> str:
     """Name of the format for a file: the one that is asked for, else that of its suffix, else PLY.
 
-    Raises `SettingsError` where the suffix is that of another format than is asked for, or of one that gsseg only
-    reads, and what `check_format` raises of what is asked for.
+    Raises `SettingsError` where the suffix is that of another format than is asked for, or of one that gsseg does not
+    write, and what `check_format` raises of what is asked for.
     """
     from gsseg_core.scene.scene_formats import SCENE_FORMATS  # `gsseg --help` does without.
 
@@ -96,12 +98,12 @@ def format_of(path: str | os.PathLike[str], asked: str | None = None) -> str:
     fits = {suffix: name for name, writer in SCENE_WRITERS.items() for suffix in writer.suffixes}
     suffix = max(filter(file.endswith, fits), key=len, default=None)
     by_suffix = None if suffix is None else fits[suffix]
-    only_read = None if by_suffix else next((known for known in SCENE_FORMATS if file.endswith(known.suffixes)), None)
-    if only_read:
-        suffixes = ", ".join(writer.suffixes[0] for writer in SCENE_WRITERS.values())
-        raise SettingsError(
-            f"{path}: has the suffix of {only_read.name}, which gsseg reads and does not write; expected {suffixes}"
-        )
+    if by_suffix is None:
+        only_read = next((known.name for known in SCENE_FORMATS if file.endswith(known.suffixes)), None)
+        if only_read or file.endswith(_FOREIGN):
+            known = f"{only_read}, which gsseg reads and does not write" if only_read else "a format of others"
+            suffixes = ", ".join(writer.suffixes[0] for writer in SCENE_WRITERS.values())
+            raise SettingsError(f"{path}: has the suffix of {known}; expected {suffixes}")
     if asked is None or by_suffix in (None, asked):
         return asked or by_suffix or DEFAULT
     raise SettingsError(

@@ -204,6 +204,8 @@ def test_the_format_of_a_file_is_what_its_suffix_says() -> None:
     for asked_for in (None, "ply"):
         with pytest.raises(SettingsError, match=r"a\.ksplat: has the suffix of ksplat, which gsseg reads and does not"):
             format_of("a.ksplat", asked_for)
+        with pytest.raises(SettingsError, match=r"a\.USDZ: has the suffix of a format of others; expected \.ply, "):
+            format_of("a.USDZ", asked_for)
     with pytest.raises(SettingsError, match=r"a\.spz: has the suffix of the format spz, but glb is asked for"):
         format_of("a.spz", "glb")
     with pytest.raises(SettingsError, match="suffix of the format compressed-ply, but ply"):
