@@ -31,7 +31,7 @@ from gsseg_core.cli.shared import (
     placed,
 )
 from gsseg_core.cli.terminal import note, tell
-from gsseg_core.errors import GssegError, SettingsError
+from gsseg_core.errors import CameraFileError, GssegError, SettingsError
 from gsseg_core.kernels import kernel_cache
 
 DESCRIPTION = """
@@ -100,18 +100,20 @@ def run(options: argparse.Namespace) -> int:
         raise SettingsError(
             "gsseg doctor: --scene is given alone; expected a dataset, too, whose cameras are to fit it"
         )
-    if options.path:
-        options.labels = labels_path(options.path, options.labels)
-    if options.scene:
-        return _examine_frame(options)
-    if options.path:
+    if not options.path:
+        findings = examine(note)
+        tell(describe(findings))
+        return 0 if works(findings) else 2
+    options.labels = labels_path(options.path, options.labels)
+    try:
+        if options.scene:
+            return _examine_frame(options)
         with hint_at_own_ids():
             dataset = examine_dataset(options.path, options.labels)
-        tell(_listed(dataset or examine_scene(options.path)))
-        return 0
-    findings = examine(note)
-    tell(describe(findings))
-    return 0 if works(findings) else 2
+    except CameraFileError as error:  # Hints are for commands that have --data.
+        raise CameraFileError(str(error).replace("type --data ", "type gsseg doctor ")) from error
+    tell(_listed(dataset or examine_scene(options.path)))
+    return 0
 
 
 def _examine_frame(options: argparse.Namespace) -> int:
@@ -163,7 +165,6 @@ def examine_dataset(path: str, labels: str) -> list[Finding]:
     from gsseg_core.data.camera_files import find_cameras, read_cameras
     from gsseg_core.data.dataset import Dataset
     from gsseg_core.data.hints import mask_hint
-    from gsseg_core.errors import CameraFileError
     from gsseg_core.scene.scene_formats import find_format, scene_hint
     from gsseg_core.text import clipped, counted, masks_line
 

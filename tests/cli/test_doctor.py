@@ -11,6 +11,7 @@ from importlib import metadata
 from pathlib import Path
 
 import pytest
+from small_scenes import write_dataset
 
 from gsseg_core.cli import doctor
 from gsseg_core.cli.arguments import COMMANDS, build_parser, command_module
@@ -163,6 +164,14 @@ def test_doctor_says_what_to_type_for_all_that_is_missing(monkeypatch: pytest.Mo
     assert named(found, "rclpy").mark == "-"
     assert all(finding.fix for finding in found if finding.mark in ("-", "!!") and finding.name != "programs")
     assert "does not work here" in describe(found)
+
+
+def test_doctor_of_a_file_for_a_dataset_says_what_to_type_to_it(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    write_dataset(tmp_path)
+    assert main(["doctor", str(tmp_path / "scene.ply"), "--scene", str(tmp_path / "scene.ply")]) == 2
+    assert f"it is a file: type gsseg doctor {tmp_path}\n" in capsys.readouterr().err
 
 
 def test_doctor_reports_a_kernel_cache_that_cannot_be_written(monkeypatch: pytest.MonkeyPatch) -> None:
