@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import math
 import re
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
@@ -128,7 +129,8 @@ def write_overview(
     paths = []
     if images:
         paths.append(folder / "contact_sheet.png")
-        save(paths[-1], contact_sheet(images, captions, 4))
+        # A tower of hundreds of views would be a thin line on a screen.
+        save(paths[-1], contact_sheet(images, captions, max(4, math.ceil(len(images) ** 0.5))))
     paths.append(folder / "legend.png")
     names, counts = result.class_names, result.counts()
     if len(names) > LEGEND_CLASSES:

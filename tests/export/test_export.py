@@ -16,8 +16,8 @@ from small_scenes import NAMES, NUM_CLASSES, balls_on_a_table, clean_views
 from gsseg_core.errors import PathTakenError, WriteError
 from gsseg_core.export import class_files as export
 from gsseg_core.export.class_files import class_file_name, export_classes
-from gsseg_core.export.pictures import legend, palette
-from gsseg_core.export.view_pictures import draw_views, view_file_name, write_pictures
+from gsseg_core.export.pictures import legend, palette, save_png
+from gsseg_core.export.view_pictures import draw_views, view_file_name, write_overview, write_pictures
 from gsseg_core.files.json_files import write_json
 from gsseg_core.files.run_folder import RUN_FILE
 from gsseg_core.refine.settings import PAPER, RefineSettings
@@ -144,6 +144,15 @@ def test_every_name_of_a_view_gives_a_file_name_that_can_be_written(tmp_path: Pa
 )  # fmt: skip
 def test_names_of_classes_become_safe_names_of_files(name: str, file_name: str) -> None:
     assert class_file_name(7, name) == file_name
+
+
+def test_a_contact_sheet_of_very_many_views_is_about_as_wide_as_high(tmp_path: Path) -> None:
+    sides = {}
+    for count in (16, 100):
+        write_overview(RESULT, [np.zeros((60, 80, 3), np.uint8)] * count, ["a"] * count, tmp_path, save_png)
+        with Image.open(tmp_path / "contact_sheet.png") as sheet:
+            sides[count] = sheet.size
+    assert sides[16][0] == 4 * 92 + 12 and sides[100][0] == 10 * 92 + 12 and sides[100][1] < 1.2 * sides[100][0]
 
 
 def test_pictures_are_an_overlay_per_view_a_contact_sheet_and_a_legend(tmp_path: Path) -> None:
