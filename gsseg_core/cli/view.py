@@ -59,6 +59,7 @@ def run(options: argparse.Namespace) -> int:
 
 
 def _show(options: argparse.Namespace, listener: Listener, viewer_module: ModuleType) -> int:
+    from gsseg_core.objects.object_table import object_name
     from gsseg_core.scene.gaussian_scene import GaussianScene
     from gsseg_core.segmentation import Segmentation
     from gsseg_core.viewer.learnt_views import LearntFrom
@@ -81,6 +82,11 @@ def _show(options: argparse.Namespace, listener: Listener, viewer_module: Module
     views = learnt.views(dataset) if dataset else []
     if dataset and not views:
         note(f"there are no views to jump to: found no mask of a train view in {Path(options.data) / learnt.labels}")
+    found = segmentation and any(name == object_name(k) for k, name in segmentation.class_names.items() if k)
+    if views and found and learnt.report is None:
+        # As of one that was saved from the viewer. Its masks would be shown as objects that they are not.
+        note(f"there are no views to jump to: no report.json beside {options.segmentation} says what ids of masks are")
+        views = []
     read = segmentation.numbered() if segmentation else None
     labelling = Labelling.of(read) if read else Labelling.unknown(len(scene), dataset.class_names if dataset else None)
     source = open_source("ros", scene) if options.ros else None

@@ -55,8 +55,8 @@ def shown_views(data: Path, monkeypatch: pytest.MonkeyPatch, *options: str) -> l
     return given
 
 
-def test_masks_of_ids_of_each_views_own_are_shown_as_the_objects_that_they_were_found_to_be(
-    data: Path, monkeypatch: pytest.MonkeyPatch
+def test_masks_of_ids_of_each_views_own_are_shown_as_the_objects_that_they_were_found_to_be_or_not_at_all(
+    data: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     (data / "sam").mkdir()
     true = Dataset(data).views("train")
@@ -72,6 +72,9 @@ def test_masks_of_ids_of_each_views_own_are_shown_as_the_objects_that_they_were_
         known = labels != UNKNOWN
         assert known.mean() > 0.9
         np.testing.assert_array_equal(labels[known], np.array(objects)[same.read_labels()[known]])
+    (out / "segmentation.npz").rename(data / "saved.npz")
+    assert shown_views(data, monkeypatch, "--segmentation", str(data / "saved.npz")) == []
+    assert "no report.json beside" in capsys.readouterr().err
 
 
 def test_masks_are_shown_in_the_classes_of_the_label_map_that_the_run_took(
