@@ -28,6 +28,7 @@ _NAMES = ("chromium", "chromium-browser", "google-chrome", "google-chrome-stable
 _FLAGS = (
     "--use-angle=swiftshader",
     "--enable-unsafe-swiftshader",
+    "--disable-gpu-compositing",
     "--no-sandbox",
     "--disable-quic",
     "--no-first-run",
@@ -35,6 +36,13 @@ _FLAGS = (
     "--disable-component-update",
     "--disable-sync",
 )
+
+# A page that draws all the time, as the viewer does, would keep a core busy by WebGL in software.
+_FEW_FRAMES = """
+const frame = window.requestAnimationFrame.bind(window);
+window.requestAnimationFrame = draw => setTimeout(() => frame(draw), 200);
+window.cancelAnimationFrame = clearTimeout;
+"""
 
 
 def find_chromium() -> str | None:
@@ -81,6 +89,7 @@ def opened_page(
     complaints: list[str] = []
     context = browser.new_context(viewport={"width": width, "height": height}, accept_downloads=True, **options)
     context.set_default_timeout(1000 * PATIENCE)  # Of pictures, too, which a busy machine takes half a minute to take.
+    context.add_init_script(_FEW_FRAMES)
     page = context.new_page()
     page.on("pageerror", lambda error: complaints.append(str(error)))
     page.on("console", lambda message: complaints.append(message.text) if message.type == "error" else None)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import closing, contextmanager
 from typing import TYPE_CHECKING, Any
 
@@ -38,11 +38,16 @@ class Shown:
     def wait(self, condition: Callable[[], Any], what: str) -> None:
         wait_until(condition, what, pause=lambda: self.page.wait_for_timeout(50))
 
-    def looks_like(self, label: int) -> bool:
-        """Whether the colour of a class is anywhere in the picture."""
-        hue = self.picture() - self.picture().mean(axis=2, keepdims=True)
-        color = np.array(self.viewer.state.model.color(label))
-        return int((np.abs(hue - FILL * (color - color.mean())).max(axis=2) < 12).sum()) > 40
+    def looks_like(self, *labels: int, without: Sequence[int] = ()) -> bool:
+        """Whether the colours of some classes, and none of others, are anywhere in the picture."""
+        picture = self.picture()
+        hue = picture - picture.mean(axis=2, keepdims=True)
+
+        def is_there(label: int) -> bool:
+            color = np.array(self.viewer.state.model.color(label))
+            return int((np.abs(hue - FILL * (color - color.mean())).max(axis=2) < 12).sum()) > 40
+
+        return all(map(is_there, labels)) and not any(map(is_there, without))
 
     def pixel_of(self, label: int) -> tuple[float, float]:
         """Where the middle of a class is on the page."""

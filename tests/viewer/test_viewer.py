@@ -60,7 +60,7 @@ def shown(opened: Shown) -> Shown:
         pass
     opened.viewer.state.change(lambda model: model.show_all())
     opened.tab("Classes")
-    opened.wait(lambda: opened.looks_like(1) and opened.looks_like(2), "all classes")
+    opened.wait(lambda: opened.looks_like(1, 2), "all classes")
     return opened
 
 
@@ -89,14 +89,14 @@ def test_a_class_is_isolated_and_another_is_removed(shown: Shown) -> None:
     mug = f"{NAMES[2]} {int((TRUTH == 2).sum())}"
     shown.pressing("switch it on or off", "only this")
     shown.press(mug)
-    shown.wait(lambda: shown.looks_like(2) and not shown.looks_like(1), "the mug alone")
+    shown.wait(lambda: shown.looks_like(2, without=[1]), "the mug alone")
     shown.pressing("only this", "remove")
     shown.press(mug)
     shown.wait(lambda: not shown.looks_like(2), "nothing")
     assert 2 in shown.viewer.state.model.removed
     shown.pressing("remove", "switch it on or off")
     shown.press("show all")
-    shown.wait(lambda: shown.looks_like(1) and shown.looks_like(2), "all classes")
+    shown.wait(lambda: shown.looks_like(1, 2), "all classes")
 
 
 def test_a_search_leaves_the_classes_whose_names_have_the_word(shown: Shown) -> None:
@@ -115,7 +115,7 @@ def test_a_slider_acts_at_once(shown: Shown) -> None:
     slider = shown.page.get_by_role("slider").first
     slider.focus()
     slider.press("End")
-    shown.wait(lambda: not shown.looks_like(1) and not shown.looks_like(2), "all to be less sure than that")
+    shown.wait(lambda: shown.looks_like(without=[1, 2]), "all to be less sure than that")
     assert shown.viewer.state.model.min_confidence == 1.0
     slider.press("Home")
     shown.wait(lambda: shown.looks_like(1), "the red ball")
@@ -155,9 +155,7 @@ def test_a_click_on_an_object_offers_its_parts_and_a_level_can_be_chosen(chromiu
         shown.says("red ball.2  ")
         shown.wait(lambda: viewer.state.model.ids() == [0, 2, 3, 4, 5], "the parts")
         upper, lower = (viewer.state.model.ids().index(node) for node in (5, 4))
-        shown.wait(
-            lambda: shown.looks_like(upper) and shown.looks_like(lower) and not shown.looks_like(1), "its halves"
-        )
+        shown.wait(lambda: shown.looks_like(upper, lower, without=[1]), "its halves")
         page.mouse.click(*shown.pixel_of(1))
         shown.press("its whole")
         shown.wait(lambda: viewer.state.granularity == 0.5, "the ball")
@@ -278,7 +276,7 @@ def test_codes_of_a_live_source_refresh_the_picture(chromium: Browser) -> None:
         shown.wait(lambda: (np.ptp(shown.picture(), axis=(0, 1)) > 30).any(), "grey splats")
         assert {row.label for row in viewer.state.model.rows()} == {-1}
         source.ready = True
-        shown.wait(lambda: shown.looks_like(1) and shown.looks_like(2), "the classes")
+        shown.wait(lambda: shown.looks_like(1, 2), "the classes")
         shown.tab("Save")
         shown.says("live: 7 views so far")
 
@@ -304,7 +302,7 @@ def test_a_browser_gets_images_until_it_has_shown_that_it_draws_fast(
             shown.says("This browser draws slowly")
         assert (renderer.nodes is not None) == draws
         viewer.state.change(lambda model: model.isolate(2))
-        shown.wait(lambda: shown.looks_like(2) and not shown.looks_like(1), "the mug alone")
+        shown.wait(lambda: shown.looks_like(2, without=[1]), "the mug alone")
 
 
 def test_a_browser_that_gives_no_picture_in_time_is_told_that_it_gets_images() -> None:
