@@ -73,6 +73,15 @@ def test_colmap_images_keep_the_spaces_in_their_names(tmp_path: Path, text: bool
     assert second.name == "photo 2 (1)"
 
 
+def test_colmap_images_in_text_may_have_their_columns_aligned(tmp_path: Path) -> None:
+    write_colmap(tmp_path / "sparse" / "0", ("room/0001.jpg", "0002.jpg"), text=True)
+    images = tmp_path / "sparse" / "0" / "images.txt"
+    images.write_text(images.read_text().replace(" ", "  "))
+    first, second = read_cameras(tmp_path)
+    assert_lands(first, 55, 35)
+    assert second.name == "0002"
+
+
 def test_colmap_images_of_one_name_after_their_folders_too_are_refused(tmp_path: Path) -> None:
     write_colmap(tmp_path / "sparse" / "0", ("a/b_1.jpg", "a_b/1.jpg", "c/1.jpg"))
     assert_refused(tmp_path, CameraFileError, "2 images have the stem 'a_b_1'")

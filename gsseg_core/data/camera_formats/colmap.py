@@ -136,6 +136,6 @@ def _copy_images_of_text(source: BinaryIO, target: BinaryIO) -> None:
     """
     for line in source:
         if (image := line.strip()) and not image.startswith(b"#"):
-            *pose, name = image.split(b" ", 9)
+            *pose, name = image.split(None, 9)
             line = b" ".join([*pose, name.replace(b" ", _SPACE.encode())]) + b"\n" + next(source, b"")
         target.write(line)
