@@ -143,7 +143,9 @@ def classes(run: PageInputs) -> Content:
     entries, checked, ious, tree = run.report["classes"], run.checked, run.ious, run.segmentation.tree
     largest = sorted(range(len(entries)), key=lambda k: -entries[k]["gaussians"])[:MOST_THUMBNAILS]
     found = thumbnails(largest, checked, run.images, run.colors)
-    views = checked.views_showing(len(run.colors)) if checked.checks else None
+    # Of a view that shows what no other does, nothing is predicted.
+    num_views = sum(check.checked > 0 for check in checked.checks)
+    views = checked.views_showing(len(run.colors)) if num_views else None
     rows = [
         {
             **entry,
@@ -158,12 +160,12 @@ def classes(run: PageInputs) -> Content:
         # Masks need not show any background, and objects without a Gaussian are none.
         if entry["gaussians"] or (k and not run.report.get("ids"))
     ]
-    return {"classes": rows, "many": MANY, "num_views": len(checked.checks), "held_out": checked.held_out}
+    return {"classes": rows, "many": MANY, "num_views": num_views, "held_out": checked.held_out}
 
 
 def confusion(run: PageInputs) -> Content | None:
     """Matrix of the classes that are confused most, and the largest confusions."""
-    if (found := run.confusion) is None:
+    if (found := run.confusion) is None or not len(found.pixels):
         return None
     names, shown = run.segmentation.class_names, found.most_confused(MATRIX_CLASSES)
     shares, total = found.shares(shown), max(int(found.pixels.sum()), 1)

@@ -17,6 +17,7 @@ from hypothesis import strategies as st
 from report_cases import NASTY, Outline, run_with_nasty_names, segmented
 from small_scenes import balls_on_a_table
 
+from gsseg_core.csr_rows import CSRRows
 from gsseg_core.errors import WriteError
 from gsseg_core.report.findings import MaskChecks
 from gsseg_core.report.page import environment, report_page, write_report_page
@@ -115,6 +116,21 @@ def test_a_run_of_which_no_mask_can_be_shown_gets_a_page_too(out: Path) -> None:
     sections = {section["id"] for section in page.tagged("section")}
     assert sections == {"preview", "classes", "confidence", "time", "settings"}
     assert not page.tagged("img")
+
+
+def test_where_no_other_view_predicts_anything_the_page_tells_of_no_comparison(out: Path) -> None:
+    report, (result, checked) = json.loads((out / "report.json").read_text()), segmented()
+    alone = replace(checked.checks[0], counts=CSRRows.empty(result.num_classes))
+    run = PageInputs(report, SCENE, result, MaskChecks([alone], checked.views, True), ViewImages(SCENE))
+    page = Outline(report_page(run))
+    assert "confusion" not in {section["id"] for section in page.tagged("section")}
+    assert "IoU: between" not in (said := "".join(page.said)) and "of 1" not in said
+
+
+def test_masks_that_are_as_predicted_leave_no_table_without_a_row() -> None:
+    sections = environment().get_template("sections.html.j2").module
+    told = {"names": ["a"], "shares": [[1.0]], "most": None, "pairs": []}
+    assert "they are the same" in (made := str(sections.confusion(told))) and "<table" not in made  # type: ignore[attr-defined]
 
 
 def test_the_parts_of_a_page_of_a_vocabulary_are_made_in_its_length_not_its_square(
