@@ -171,12 +171,14 @@ def _photo(view: View, picture_px: int) -> Shown | None:
     return Shown(window.camera, window.seen, _edges(light.astype(np.float32) / 255))
 
 
-def _mask(view: View, picture_px: int) -> Shown:
+def _mask(view: View, picture_px: int) -> Shown | None:
     labels = replace(view, class_names=None).read_labels()  # Names say nothing of outlines, nor of a view's own ids.
     window = _Window.of(view.camera, picture_px)
     outlines = np.zeros(labels.shape, np.float32)
     outlines[1:] = labels[1:] != labels[:-1]
     outlines[:, 1:] = np.maximum(outlines[:, 1:], labels[:, 1:] != labels[:, :-1])
+    if not outlines.any():  # As where nothing was found: from wherever it was seen, it would look so.
+        return None
     edges = window.cut(Image.fromarray(outlines), Image.Resampling.BILINEAR)
     regions = window.cut(Image.fromarray(labels), Image.Resampling.NEAREST)
     return Shown(window.camera, window.seen, _filtered(edges, _BLUR, _BLUR), np.where(window.seen, regions, UNKNOWN))

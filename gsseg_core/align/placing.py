@@ -121,7 +121,7 @@ def find_alignment(
     before = agreement(scene, search.shown, search.settings, device)
     if before is None:
         raise AlignmentError(
-            "alignment: no view has a photo or a mask; expected some, to see where cameras are by them"
+            "alignment: no view has a photo, or a mask with outlines; expected some, to see where cameras are by them"
         )
     photos = before.compared == "photos"
     agreeing: list[Found] = []

@@ -133,10 +133,13 @@ def test_real_scenes_are_never_said_not_to_fit(real_data: Path) -> None:
             assert found is None or found.agrees, (name, found)
 
 
-def test_views_that_show_nothing_are_not_judged(demo: Path, scene: GaussianScene) -> None:
-    assert place(scene, Dataset(demo, "no_such_folder"), check=True).agreement is None
-    with pytest.raises(AlignmentError, match="no view has a photo or a mask"):
-        place(scene, Dataset(demo, "no_such_folder"), align=True)
+def test_views_that_show_nothing_are_not_judged(demo: Path, scene: GaussianScene, tmp_path: Path) -> None:
+    for camera in Dataset(demo).cameras:
+        write_mask(tmp_path / f"{camera.name}.png", np.zeros((camera.height, camera.width), np.int32), 8)
+    for labels in ("no_such_folder", str(tmp_path)):
+        assert place(scene, Dataset(demo, labels), check=True).agreement is None
+        with pytest.raises(AlignmentError, match="no view has a photo, or a mask with outlines"):
+            place(scene, Dataset(demo, labels), align=True)
 
 
 def test_an_eighth_of_the_gaussians_tells_whether_cameras_fit(
