@@ -164,12 +164,17 @@ def test_long_names_and_many_classes_break_no_figure_and_make_no_page_wider(
           const bottoms = [...range.getClientRects()].map((line) => line.bottom);
           return Math.max(...bottoms) - Math.min(...bottoms) > 9;
         }}).map((figure) => figure.textContent)"""
+    cut_off = """() => [...document.querySelectorAll(".heatmap text")].filter((name) => {
+        const own = name.getBoundingClientRect(), room = name.closest("svg").getBoundingClientRect();
+        return own.left < room.left || own.top < room.top || own.right > room.right;
+    }).map((name) => name.textContent)"""
     with opened_page(chromium, width, 740) as page:
         page.goto(long_report)
         page.wait_for_selector(f"{CANVAS}[data-frames]")
         assert page.locator(".classes.many").count() == 1
         assert page.evaluate("document.documentElement.scrollWidth") <= width
         assert page.evaluate(broken) == []
+        assert page.evaluate(cut_off) == []
         whole = page.locator("th.name:has-text('object_007')").evaluate("name => name.scrollWidth <= name.clientWidth")
         assert whole, "the names that objects get are told apart by their end"
 
