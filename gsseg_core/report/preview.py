@@ -86,8 +86,9 @@ def make_preview(
     confidence, column = largest(shares)
     means, nearer = _contracted(scene.means[picked].astype(np.float64), core)
     low, high = (means.min(axis=0), means.max(axis=0)) if len(means) else core
-    extent = max(float((high - low).max()), 1e-9)
     sizes = scene.scales[picked] * (nearer * np.minimum(chance**-0.5, LARGEST_GROWTH))[:, None]
+    # One Gaussian alone extends no farther than it is large.
+    extent = max(float((high - low).max()) or float(sizes.max(initial=0)), 1e-9)
     # Gaussians thinner than a thousandth of a pixel of any screen look like those that are not.
     logs = np.log(np.clip(sizes, 1e-5 * extent, extent))
     log_scales = np.array([logs.min(), logs.max()] if len(logs) else [0.0, 1.0], np.float64)
@@ -160,9 +161,9 @@ def _contracted(means: np.ndarray, core: np.ndarray) -> tuple[np.ndarray, np.nda
     By the contraction of mip-NeRF 360 (Barron et al. 2022, eq. 10): within a sphere around the core nothing moves, and
     the infinite comes to twice its radius.
     """
-    middle, radius = core.mean(axis=0), float(np.linalg.norm(core[1] - core[0])) / 2
+    middle, radius = core.mean(axis=0), max(float(np.linalg.norm(core[1] - core[0])) / 2, np.finfo(float).tiny)
     offsets = means - middle
-    ratio = radius / np.maximum(np.linalg.norm(offsets, axis=1), max(radius, np.finfo(float).tiny))
+    ratio = radius / np.maximum(np.linalg.norm(offsets, axis=1), radius)
     nearer = ratio * (2 - ratio)
     return np.where(nearer[:, None] < 1, middle + offsets * nearer[:, None], means), nearer
 

@@ -159,6 +159,13 @@ def test_what_is_far_around_the_scene_is_shown_where_and_as_large_as_from_its_mi
     assert (np.diff(shown) > -step.max()).all() and (preview.high - preview.low).max() < 50
 
 
+def test_one_gaussian_alone_is_shown_as_large_as_it_is() -> None:
+    alone = SCENE.subset(np.arange(len(SCENE)) == 0)
+    preview = make_preview(alone, result_of(TRUTH[:1], alone))
+    low, high = preview.log_scales
+    np.testing.assert_allclose(np.exp(low + preview.records["scale"] / 255 * (high - low)), alone.scales, rtol=0.05)
+
+
 @given(st.integers(1, 40), st.integers(1, 50), st.integers(0, 1000))
 def test_no_scene_is_too_small_or_too_flat_for_a_preview(count: int, most: int, seed: int) -> None:
     rng = np.random.default_rng(seed)
