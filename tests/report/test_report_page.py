@@ -191,6 +191,14 @@ def test_any_name_stays_text_in_elements_in_attributes_and_in_json(name: str) ->
     assert "<" not in embedded and json.loads(embedded) == {"name": name}
 
 
+def test_one_class_is_not_called_classes_and_thousands_are_told_apart(out: Path) -> None:
+    report = json.loads((out / "report.json").read_text())
+    others = {"name": "", "confidence": None, "warnings": [], "sections": [], "policy": "", "style": "", "script": ""}
+    for classes, told in ((report["classes"][:2], "of 1 class"), (report["classes"][1:2] * 1200, "of 1,200 classes")):
+        page = environment().get_template("page.html.j2").render(report={**report, "classes": classes}, **others)
+        assert f"<small>{told}</small>" in page
+
+
 def test_one_view_is_not_called_views() -> None:
     sections = environment().get_template("sections.html.j2").module
     view = {"name": "a", "reliability": 1.0, "rejected_share": None, "confusions": []}
