@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from numbers import Integral
 
 from gsseg_core.errors import SettingsError
 
@@ -49,13 +50,13 @@ class RefineSettings:
 
     def __post_init__(self) -> None:
         """Validate."""
-        if not 1 <= self.k <= MAX_K or self.k != int(self.k):
+        if not isinstance(self.k, Integral) or not 1 <= self.k <= MAX_K:  # Kernels take no 50.0.
             raise SettingsError(f"refinement: found k = {self.k}; expected a whole number from 1 to {MAX_K}")
         if not 0 <= self.beta <= 1:
             raise SettingsError(f"refinement: found beta = {self.beta}; expected a probability from 0 to 1")
         if not 0 <= self.filter_sigmas < float("inf"):
             raise SettingsError(f"refinement: found filter_sigmas = {self.filter_sigmas}; expected 0 or more, finite")
-        if not 1 <= self.carve_views < float("inf") or self.carve_views != int(self.carve_views):
+        if not isinstance(self.carve_views, Integral) or self.carve_views < 1:
             raise SettingsError(f"refinement: found carve_views = {self.carve_views}; expected a whole number above 0")
         if self.carve and self.filter:
             raise SettingsError("refinement: found both carve and filter; expected one of them")

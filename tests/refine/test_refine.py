@@ -264,7 +264,8 @@ def test_scenes_of_any_size_give_the_same_result(scale):
     "wrong",
     [{"k": 0}, {"k": 2.5}, {"k": 1 << 21}, {"k": float("nan")}, {"k": float("inf")}, {"beta": -0.1},
      {"beta": float("nan")}, {"filter_sigmas": -1.0}, {"filter_sigmas": float("inf")}, {"carve_views": 0},
-     {"carve_views": 2.5}, {"carve_views": float("nan")}, {"carve_views": float("inf")}],
+     {"carve_views": 2.5}, {"carve_views": float("nan")}, {"carve_views": float("inf")}, {"k": 5.0}, {"k": "5"},
+     {"carve_views": 3.0}],
 )  # fmt: skip
 def test_settings_out_of_range_are_refused_by_name(wrong):
     with pytest.raises(SettingsError, match=f"found {next(iter(wrong))} = .*; expected"):
