@@ -65,8 +65,10 @@ class Evaluation:
                 "expected two label maps (height, width) of the same size"
             )
         for labels in (truth, prediction):
-            if labels.dtype.kind not in "iub" or labels.min(initial=0) < UNKNOWN or labels.max(initial=0) > MAX_LABEL:
-                raise MaskFormatError(f"{name}: found {labels.dtype}; expected integers {UNKNOWN} to {MAX_LABEL}")
+            ends = [int(end(initial=0)) for end in (labels.min, labels.max)] if labels.dtype.kind in "iub" else []
+            if not ends or ends[0] < UNKNOWN or ends[1] > MAX_LABEL:
+                found = f"{labels.dtype} {ends[0]} to {ends[1]}" if ends else labels.dtype
+                raise MaskFormatError(f"{name}: found {found}; expected integers {UNKNOWN} to {MAX_LABEL}")
         known = truth != UNKNOWN
         # What nobody knows is taken as predicted, so that no boundary of the truth runs along the unknown.
         truth, prediction = np.where(known, truth, prediction).astype(np.int32), prediction.astype(np.int32)

@@ -130,6 +130,8 @@ def test_what_is_no_label_is_refused_and_not_counted_as_another_one() -> None:
         for pair in ((labels, wrong), (wrong, labels)):
             with pytest.raises(MaskFormatError, match=r"view: found .*; expected integers -1 to 65534"):
                 evaluate([pair])
+    with pytest.raises(MaskFormatError, match="view: found int64 -2 to 70000; expected"):
+        evaluate([(labels, np.linspace(-2, 70000, 48).astype(np.int64).reshape(6, 8))])
 
 
 def test_an_unknown_prediction_is_a_miss_and_no_find() -> None:
