@@ -47,6 +47,23 @@ def test_soft_and_partial_masks_on_workers_give_the_same_bit_for_bit(client: Any
     assert_same(there, taught(here, views))
 
 
+def test_classes_that_only_other_workers_views_name_are_the_same_bit_for_bit(client: Any) -> None:
+    def looked_for(view: View, ids: list[int], names: dict[int, str] | None) -> View:
+        labels = view.read_labels()
+        return View.from_arrays(view.camera, np.where(np.isin(labels, ids), labels, 0), names, supervised=ids)
+
+    names = {0: "background", 1: "ball", 2: "cup", 3: "box"}  # Of five: without names, 4 is a class, too.
+    views = [looked_for(view, [1, 2], names) for view in VIEWS[:4]]
+    views += [looked_for(view, [2, 3], names) for view in VIEWS[4:6]] + [looked_for(VIEWS[6], [3], None)]
+    there, here = DistributedEM(client, SCENE, 5, SETTINGS), EMLearner(SCENE, 5, SETTINGS)
+    for learner in (there, here):
+        learner.observe_all(views)
+    assert_same(there, here)
+    for learner in (there, here):
+        learner.retract(VIEWS[6].name)  # Now 4 is no class any more.
+    assert_same(there, here)
+
+
 def with_useless_ones() -> list[View]:
     unknown = View.from_arrays(VIEWS[3].camera, np.full((48, 64), -1, np.int32))
     return [*VIEWS[:3], unknown, *VIEWS[4:], View(replace(VIEWS[3].camera, name="without a mask"))]

@@ -227,4 +227,5 @@ class DistributedEM(_OnWorkers, EMLearner):
         self, work: Callable[..., OverViews], by_view: Mapping[str, Any], tick: Tick, *arrays: CSRRows | np.ndarray
     ) -> OverViews:
         views = {name: self.views[name] for name in by_view}
-        return self._sum(partial(dask_worker.go_over, work), views, lambda done: tick(), by_view, *arrays)
+        task = partial(dask_worker.go_over, work, self._possible())  # A share may lack the views that name a class.
+        return self._sum(task, views, lambda done: tick(), by_view, *arrays)

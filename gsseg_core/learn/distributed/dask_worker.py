@@ -37,6 +37,8 @@ class NotHereError(Exception):
 class Shard(EMLearner):
     """Some of the views, prepared. Sent elsewhere or spilled to disk, it takes along only what they are prepared of."""
 
+    possible: np.ndarray  # (K,) bool: ids that are classes by the views of all workers
+
     def __getstate__(self) -> dict[str, Any]:
         """Leave the prepared views behind."""
         return {**self.__dict__, "_prepared": self._prepared.emptied()}
@@ -44,6 +46,9 @@ class Shard(EMLearner):
     def __sizeof__(self) -> int:
         """Tell Dask how much memory is in use."""
         return self._prepared.nbytes[0]
+
+    def _possible(self) -> np.ndarray:
+        return self.possible
 
 
 def load(path: str, digest: str) -> GaussianScene:
@@ -91,11 +96,13 @@ def sum_votes(shard: Shard, wanted: dict[str, Any]) -> OverViews:
 
 
 def go_over(
-    work: Callable[..., OverViews], shard: Shard, by_view: dict[str, Any], *arrays: CSRRows | np.ndarray
-) -> OverViews:
+    work: Callable[..., OverViews], possible: np.ndarray, shard: Shard, by_view: dict[str, Any],
+    *arrays: CSRRows | np.ndarray,
+) -> OverViews:  # fmt: skip
     """Have a method of `EMLearner` go over the views of a shard, as `EMLearner._over_views` does over all."""
     usable = (as_compiled_for(array) if isinstance(array, CSRRows) else array for array in arrays)
     with _all_threads():
+        shard.possible = possible
         return work(shard, *usable, by_view, lambda: None)
 
 
