@@ -310,7 +310,7 @@ class LiveSession:
             if not self.has_codes:
                 raise NoCodesError(f"{path}: nothing to save; expected at least one view to be fused first")
             learnt, fused, scene = self._learnt, self.num_fused, self.scene
-            known, names = self._live.state(), self.class_names
+            known, names = self._live.state(), {**self._classes.names, **self.class_names}  # of those not yet seen, too
             state = replace(known, num_fused=fused, class_names=names, learnt=learnt, per_view=self._PER_VIEW)
         state.save(path, scene.digest)
         return learnt.num_views if learnt is not None else fused

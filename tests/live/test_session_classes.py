@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import numpy as np
 import pytest
 from hypothesis import given
@@ -74,3 +76,15 @@ def test_a_class_that_was_only_numbered_gets_its_name_when_it_is_told() -> None:
     session._classes.names = {0: "background", 1: "class_01", 2: "chair"}  # As of a saved state.
     assert session.number_classes({1: "cup", 2: "table"}) == {1: 1, 2: 3}
     assert session._classes.names == {0: "background", 1: "cup", 2: "chair", 3: "table"}
+
+
+def test_a_class_that_is_announced_and_not_yet_seen_keeps_its_name_and_number_after_loading(tmp_path: Path) -> None:
+    session = fed(LiveSession(balls_on_a_table()[0]), clean_views(2))
+    ids = session.number_classes({1: "lamp", 9: "cup"})
+    assert ids == {1: 1, 9: 9}
+    session.save(tmp_path / "state.npz")
+    other = LiveSession(session.scene)
+    other.load(tmp_path / "state.npz")
+    assert other.class_names == session.class_names
+    for each in (session, other):
+        assert each.number_classes({2: "sofa", 1: "cup"}, keep_numbers=False) == {2: 10, 1: 9}
