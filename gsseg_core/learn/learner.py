@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import threading
 from abc import ABC, abstractmethod
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Sequence
@@ -37,8 +36,6 @@ from gsseg_core.text import counted
 
 Self = TypeVar("Self", bound="Learner")
 R = TypeVar("R")
-
-_VOTES_LENT = threading.Lock()  # while a view's votes are out of the sum; not in each learner, as those travel
 
 
 def _check_num_classes(num_classes: int) -> None:
@@ -261,13 +258,9 @@ class Learner(ABC):
 
     def vote_rows_without(self, name: str) -> CSRRows:
         """Votes of all other views as probabilities, as `vote_rows` has those of all."""
-        observation = self.observation(name)
-        with _VOTES_LENT:
-            observation.vote(self._votes, sign=-1)
-            try:
-                return self.vote_rows()
-            finally:
-                observation.vote(self._votes)
+        others = self._votes.copy()
+        self.observation(name).vote(others, sign=-1)
+        return vote_shares(others.rows(), self._possible())
 
     def evidence(self) -> np.ndarray:
         """Weight of the labelled pixels that saw each Gaussian, over all views, in px, (N,) float32."""

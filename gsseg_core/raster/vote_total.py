@@ -7,6 +7,8 @@ more zeros, and smaller ones need a larger table of their numbers.
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from contextlib import contextmanager
 from typing import NamedTuple
 
 import numba as nb
@@ -70,15 +72,24 @@ class VoteTotal:
     def add(self, cast: PairVotes, label_votes: CSRRows, sign: int = 1) -> None:
         """Add the votes of a view, or take them back with the `sign` -1.
 
-        A pixel of each label votes as the rows `label_votes` say, float64. Where there is too little memory, nothing
-        has changed.
+        A pixel of each label votes as the rows `label_votes` say, float64. Where there is too little memory, or Ctrl-C
+        ends it, nothing has changed.
         """
-        self._make_pages(_number_pairs(self._table, self.order.places, cast, label_votes, self._count))
-        add_pairs(self._table, self.order.places, self._pages.reshape(-1), cast, label_votes, sign)
+        added = np.full(1, False)
+        with self._pages_whole():
+            self._make_room(_number_pairs(self._table, self.order.places, cast, label_votes, self._count))
+            places, cells = self.order.places, self._pages.reshape(-1)
+            try:
+                add_pairs(self._table, places, cells, cast, label_votes, sign, added)
+            except BaseException:  # Ctrl-C is heard when the kernel has ended.
+                if added[0]:
+                    add_pairs(self._table, places, cells, cast, label_votes, -sign, added)
+                raise
 
     def add_rows(self, rows: CSRRows, first: int = 0) -> None:
         """Add votes in units, int64, to those of consecutive Gaussians from the `first` on."""
-        self._make_pages(_number_rows(self._table, self.order.places, rows, first, self._count))
+        with self._pages_whole():
+            self._make_room(_number_rows(self._table, self.order.places, rows, first, self._count))
         _add_rows(self._table, self.order.places, self._pages.reshape(-1), rows, first)
 
     def rows(self) -> CSRRows:
@@ -113,21 +124,23 @@ class VoteTotal:
             table[kept] = np.arange(self._count)
         self._table, self.shape = table, (self.shape[0], num_classes)
 
-    def _make_pages(self, count: int) -> None:
-        """Make room for so many pages, as the table has now; without memory for them, it has none that are new."""
+    @contextmanager
+    def _pages_whole(self) -> Iterator[None]:
+        """Have the table name no page that there is no room for, however the body ends."""
         try:
-            self._make_room(count)
+            yield
         except BaseException:
             for pages in self._table:
                 pages[pages >= self._count] = _NONE
             raise
-        self._count = count
 
     def _make_room(self, count: int) -> None:
+        """Make room for so many pages, as the table has now."""
         if count > len(self._pages):
             pages = np.zeros((max(count, len(self._pages) * 5 // 4), PAGE), np.int64)
             pages[: self._count] = self._pages[: self._count]
             self._pages = pages
+        self._count = count
 
 
 @called_by_kernels
@@ -174,6 +187,7 @@ def add_pairs(
     table: np.ndarray, places: np.ndarray,  # (K, blocks) with a page wherever one is needed; (N,) int32
     cells: np.ndarray,  # (pages * PAGE,)
     cast: PairVotes, label_votes: CSRRows, sign: int,
+    added: np.ndarray,  # (1,) bool, out: true once they have been added
 ) -> None:  # fmt: skip
     """Add a view's votes to the cells of pages, or take them away; see `VoteTotal.add`."""
     gaussians, labels, weights, parts = cast
@@ -181,8 +195,9 @@ def add_pairs(
         for s in range(parts[part, 0], parts[part, 1]):
             prefetch(cells, _next_cell(table, places, cast, label_votes, s, parts[part, 1] - 1))
             for z in range(label_votes.indptr[labels[s]], label_votes.indptr[labels[s] + 1]):
-                added = sign * vote_units(weights[s], label_votes.data[z])
-                cells[_cell(table, places[gaussians[s]], label_votes.indices[z])] += added
+                units = sign * vote_units(weights[s], label_votes.data[z])
+                cells[_cell(table, places[gaussians[s]], label_votes.indices[z])] += units
+    added[0] = True
 
 
 @kernel

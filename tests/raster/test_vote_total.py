@@ -76,6 +76,31 @@ def test_views_that_are_added_and_taken_back_in_any_order_leave_the_sums_of_a_de
     assert not len(total.rows().data)
 
 
+@pytest.mark.parametrize("stage", ["_number_pairs", "_make_room", "add_pairs"])
+def test_ctrl_c_that_is_heard_when_a_kernel_has_ended_changes_nothing(
+    stage: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    rng = np.random.default_rng(0)
+    first, second = cast(rng, 700, 5), cast(rng, 700, 5)
+    total, owner = VoteTotal(700, 9), VoteTotal if stage == "_make_room" else vote_total
+    total.add(*first)
+    before, work = total.dense(), getattr(owner, stage)
+
+    def interrupted(*given: object) -> None:
+        monkeypatch.setattr(owner, stage, work)
+        work(*given)
+        raise KeyboardInterrupt
+
+    for sign in (1, -1):
+        monkeypatch.setattr(owner, stage, interrupted)
+        with pytest.raises(KeyboardInterrupt):
+            total.add(*second, sign)
+        np.testing.assert_array_equal(total.dense(), before)
+        total.add(*second, sign)
+        np.testing.assert_array_equal(total.dense() - before, sign * dense_votes((700, 9), *second))
+        before = total.dense()
+
+
 def test_the_order_of_views_and_of_gaussians_in_pages_changes_nothing_but_the_pages() -> None:
     rng = np.random.default_rng(0)
     views, found = [cast(rng, 700, 5) for _ in range(3)], []
@@ -165,7 +190,7 @@ def test_without_memory_for_pages_nothing_changes(monkeypatch: pytest.MonkeyPatc
     with monkeypatch.context() as patch:
         patch.setattr(vote_total.np, "zeros", full)
         with pytest.raises(MemoryError):
-            total._make_pages(vote_total._number_pairs(total._table, total.order.places, *second, total._count))
+            total.add(*second)
     np.testing.assert_array_equal(total.dense(), before)
     total.add(*second)
     np.testing.assert_array_equal(total.dense(), before + dense_votes((600, 7), *second))
