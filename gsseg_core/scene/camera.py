@@ -53,6 +53,9 @@ class Camera:
 
     def __post_init__(self) -> None:
         """Copy the matrices and validate."""
+        for side in ("width", "height"):
+            if isinstance(size := getattr(self, side), np.integer):  # Products of short ones overflow.
+                object.__setattr__(self, side, int(size))
         object.__setattr__(self, "K", np.array(self.K, np.float64))
         object.__setattr__(self, "world_to_camera", np.array(self.world_to_camera, np.float64))
         if flaw := self._flaw_of_intrinsics():
@@ -143,7 +146,7 @@ class Camera:
     def _flaw_of_intrinsics(self) -> str:
         """Say what is wrong with size and `K`, or "" if they are usable."""
         for side, size in (("width", self.width), ("height", self.height)):
-            if not isinstance(size, (int, np.integer)) or size < 1:
+            if not isinstance(size, int) or size < 1:
                 return f"{side} is {clipped(size)}; expected a whole number of pixels, at least 1"
         check_pixels(self.width, self.height, self._who, IntrinsicsError)
         K = self.K

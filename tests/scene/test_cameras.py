@@ -19,7 +19,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from gsseg_core.errors import IntrinsicsError, PoseError
-from gsseg_core.scene.camera import Camera
+from gsseg_core.scene.camera import Camera, smaller_camera
 
 
 def test_a_known_point_lands_on_a_known_pixel() -> None:
@@ -105,3 +105,11 @@ def K_with(row: int, column: int, value: float) -> np.ndarray:
 def test_impossible_intrinsics_are_refused(width: Any, height: int, matrix: np.ndarray, message: str) -> None:
     with pytest.raises(IntrinsicsError, match=f"camera 'a': .*{message}"):
         Camera("a", width, height, matrix, np.eye(4))
+
+
+@pytest.mark.parametrize("number", [np.uint8, np.uint16, np.int64])
+def test_sizes_of_numpys_integers_are_taken_as_numbers_that_do_not_overflow(number: type[np.integer[Any]]) -> None:
+    camera = Camera("a", number(240), number(250), K, np.eye(4))  # type: ignore[arg-type]
+    assert camera.width * camera.height == 60_000
+    assert type(camera.width) is type(camera.height) is int
+    assert smaller_camera(camera, 3).width == 80
