@@ -222,6 +222,7 @@ class ViewOperator(ViewRenderer):
         """Refuse what a kernel would take for places beyond its tables."""
         self.camera.check_image(labels, "image has")
         most = MAX_LABEL if evidence is None else len(evidence.rest) - 1
-        if labels.dtype.kind not in "iu" or labels.max() > most:
-            found = f"view '{self.camera.name}': labels are {labels.dtype} up to {labels.max()}"
-            raise MaskFormatError(f"{found}; expected integers up to {most}")
+        # What int32 cannot hold, as the int64 that NaN becomes, would be taken for the label in its lower half.
+        if labels.dtype.kind not in "iu" or labels.max() > most or labels.min() < -(2**31):
+            found = f"view '{self.camera.name}': labels are {labels.dtype} from {labels.min()} up to {labels.max()}"
+            raise MaskFormatError(f"{found}; expected integers up to {most}, of 32 bits")

@@ -19,9 +19,10 @@ def test_what_kernels_would_take_for_places_beyond_their_tables_is_refused():
     scene, camera = random_view(0)
     operator, labels = make_operator(scene, camera), np.full((21, 37), 2, np.int32)
     few = LabelEvidence(np.arange(2, dtype=np.int32))
-    for mask, evidence in [(labels, few), (labels + 1_000_000_000, None), (labels.astype(float), None)]:
+    unfit = labels + np.int64(-(2**32) - 1)  # As int32, class 1.
+    for mask, evidence in [(labels, few), (labels + 10**9, None), (unfit, None), (labels.astype(float), None)]:
         for use in (operator.observe, lambda *given: operator.vote(*given, VoteTotal(120, 9))):
-            with pytest.raises(MaskFormatError, match=r"view 'view': labels are (int32|float64) up to .* expected"):
+            with pytest.raises(MaskFormatError, match=r"view 'view': labels are (int32|int64|float64) .* expected"):
                 use(mask, evidence)
     seen = operator.observe(labels.astype(np.uint8))
     for use in (seen.vote, lambda *given: operator.vote(labels, None, *given)):
