@@ -64,6 +64,8 @@ def make_operator(scene: GaussianScene, camera: Camera, device: str = "cpu") -> 
     ------
     SettingsError
         There is no such device, or what it needs is not installed.
+    SceneValueError
+        The Gaussians touch more tiles of the view, of 16 x 16 px, than can be numbered: 2^31 - 1, each for each.
     """
     operator: ViewOperator = _module_of(device).view_operator(scene, camera, device)
     operator.scene = scene

@@ -81,7 +81,8 @@ class ViewOperator(ViewRenderer):
         Raises
         ------
         MaskFormatError
-            The labels are not whole numbers, or larger than `MAX_LABEL`, or than there is evidence for.
+            The labels are not whole numbers that 32 bits hold, or larger than `MAX_LABEL`, or than there is evidence
+            for.
         MaskSizeError
             The labels are not of the camera's size.
         SceneValueError
