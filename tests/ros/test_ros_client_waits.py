@@ -273,6 +273,7 @@ def test_learning_ends_with_an_error_where_the_node_was_killed_and_started_anew_
         running.join()
         assert isinstance(running.error, NodeUnavailableError), running.error
         assert "/gsseg went away during learn" in str(running.error)
+        client.wait_until_active(PATIENCE)  # The new one answers before it is.
         assert client.learn("data", timeout=PATIENCE).report.num_views == 4
 
 
