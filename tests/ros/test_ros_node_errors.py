@@ -214,12 +214,12 @@ MORE_CASES = [
 
 @pytest.fixture(scope="module")
 def starved(root: Path, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Robot]:
-    """A node with so many Gaussians and classes that even a session without any votes takes 190 MB.
+    """A node with so many Gaussians and classes that a session takes far more than it is left.
 
     It is in a domain of its own: the other nodes need not hear of a topic for each class.
     """
     rng = np.random.default_rng(0)
-    scene = build(np.zeros(1_000_000, np.int64), rng.uniform(-1, 1, (1_000_000, 3)), np.full((1_000_000, 3), 0.004))
+    scene = build(np.zeros(1_500_000, np.int64), rng.uniform(-1, 1, (1_500_000, 3)), np.full((1_500_000, 3), 0.004))
     scene.save(root / "large.ply")
     core_session(scene, clean_views(1)).save(root / "narrow_state.npz")
     names = [*CLASSES, *(f"class {k}" for k in range(len(CLASSES), 1500))]
