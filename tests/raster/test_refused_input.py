@@ -22,7 +22,9 @@ def test_what_kernels_would_take_for_places_beyond_their_tables_is_refused():
     unfit = labels + np.int64(-(2**32) - 1)  # As int32, class 1.
     for mask, evidence in [(labels, few), (labels + 10**9, None), (unfit, None), (labels.astype(float), None)]:
         for use in (operator.observe, lambda *given: operator.vote(*given, VoteTotal(120, 9))):
-            with pytest.raises(MaskFormatError, match=r"view 'view': labels are (int32|int64|float64) .* expected"):
+            with pytest.raises(
+                MaskFormatError, match=r"view 'view': labels are (int32|int64|float64) from .* up to .* expected"
+            ):
                 use(mask, evidence)
     seen = operator.observe(labels.astype(np.uint8))
     for use in (seen.vote, lambda *given: operator.vote(labels, None, *given)):

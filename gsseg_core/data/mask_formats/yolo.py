@@ -40,8 +40,9 @@ def is_yolo(place: Place) -> bool:
 def read_yolo(place: Place) -> MaskSet:
     """Read YOLO; each file is read once for its classes, and again when its view is asked for."""
     files = place.by_view(".txt")
-    tracked = _are_tracked(place, files.values())
-    ids = {label for path in files.values() for label, _ in _lines(place, path, tracked)}
+    texts = {path: place.text(path) for path in files.values()}
+    tracked = _are_tracked(place.path, texts.values())
+    ids = {label for path, text in texts.items() for label, _ in _lines(path, text, tracked)}
     names = _names(place)
     views = {view: ViewMask(str(path), partial(_read, place, path, tracked)) for view, path in files.items()}
     if names is None:
@@ -53,18 +54,18 @@ def read_yolo(place: Place) -> MaskSet:
     return MaskSet(views, {0: BACKGROUND_NAME, **{c + 1: name for c, name in sorted(names.items())}})
 
 
-def _are_tracked(place: Place, paths: Iterable[Path]) -> bool:
+def _are_tracked(place: Path, texts: Iterable[str]) -> bool:
     """Whether lines end with a confidence and the id of a track, which together look like a point.
 
     An id above 1 is no share of an image. Raises `MaskFormatError` where a track of the id 1 is all that there may be.
     """
-    lines = [[line for line in place.text(path).splitlines() if len(line.split()) % 2] for path in paths]
+    lines = [[line for line in text.splitlines() if len(line.split()) % 2] for text in texts]
     ids = [[int(end[1]) if (end := _TRACK.search(line)) else 0 for line in of_view] for of_view in lines]
     every = [one for of_view in ids for one in of_view]
     if len(every) > 1 and set(every) == {1} and max(map(len, ids)) == 1:
         found = quoted(" ".join(next(filter(None, lines))[0].split()[-2:]))
         raise MaskFormatError(
-            f"{place.path}: lines end with {found} and the like, which may be a point, or a confidence and the id of a "
+            f"{place}: lines end with {found} and the like, which may be a point, or a confidence and the id of a "
             "track; expected no confidences (save_conf=False of Ultralytics)"
         )
     return max(every, default=0) > 1
@@ -73,14 +74,14 @@ def _are_tracked(place: Place, paths: Iterable[Path]) -> bool:
 def _read(place: Place, path: Path, tracked: bool, camera: Camera) -> npt.NDArray[np.int32]:
     size = camera.image_size
     shapes = []
-    for i, (label, points) in enumerate(_lines(place, path, tracked), 1):
+    for i, (label, points) in enumerate(_lines(path, place.text(path), tracked), 1):
         shapes.append(Shape(label, Polygons.of((points * np.array(size)).tolist(), f"{path}, outline {i}")))
     return Drawing(*size, shapes).labels(camera, str(path))
 
 
-def _lines(place: Place, path: Path, tracked: bool) -> list[tuple[int, npt.NDArray[np.float64]]]:
+def _lines(path: Path, text: str, tracked: bool) -> list[tuple[int, npt.NDArray[np.float64]]]:
     """Label and polygon (P, 2), in shares of width and height, of each line."""
-    lines = [(f"{path}, line {i}", line.split()) for i, line in enumerate(place.text(path).splitlines(), 1)]
+    lines = [(f"{path}, line {i}", line.split()) for i, line in enumerate(text.splitlines(), 1)]
     are_boxes = all(_numbers(words, tracked) <= _BOX for _, words in lines)
     found = []
     for where, words in lines:
