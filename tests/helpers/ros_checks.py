@@ -6,12 +6,8 @@ import resource
 from collections.abc import Iterator
 from contextlib import contextmanager
 
-import pytest
-from ros_robot import Robot
-
-pytest.importorskip("gsseg_msgs.msg", reason="gsseg_msgs is not installed")
-
 from gsseg_msgs.msg import SegmentationReport
+from ros_robot import Robot
 from sensor_msgs.msg import PointCloud2
 
 TOKENS = ("background", "red_ball", "cup_mug", "box")

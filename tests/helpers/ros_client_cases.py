@@ -17,8 +17,6 @@ from patience import PATIENCE
 from ros_helpers import Process, Ros, wait_until
 from small_scenes import NAMES, write_dataset
 
-pytest.importorskip("gsseg_msgs.msg", reason="gsseg_msgs is not installed")
-
 from gsseg_core.data.dataset import Dataset
 from gsseg_core.data.view import View
 from gsseg_ros.client import NodeUnavailableError, SegmentationClient, SegmentationError

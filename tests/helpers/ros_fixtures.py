@@ -14,17 +14,13 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from rclpy.parameter import Parameter
 from ros_datasets import copied, write_long_dataset
 from ros_helpers import PATIENCE, Ros
 from ros_robot import CLASSES, Robot, core_session, private_ros
 from small_scenes import balls_on_a_table, clean_views, write_dataset
 
 from gsseg_core.scene.gaussian_scene import GaussianScene
-
-pytest.importorskip("gsseg_msgs.msg", reason="gsseg_msgs is not installed")
-
-from rclpy.parameter import Parameter
-
 from gsseg_ros.node import segment_node
 from gsseg_ros.node.node_executor import NodeExecutor
 from gsseg_ros.node.segment_node import SegmentNode

@@ -10,14 +10,10 @@ from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from typing import Any
 
-import pytest
-from ros_helpers import Ros, wait_until
-from ros_robot import SECOND, SERVICES, STEP, messages
-
-pytest.importorskip("gsseg_msgs.msg", reason="gsseg_msgs is not installed")
-
 from rclpy.lifecycle import TransitionCallbackReturn
 from rclpy.parameter import Parameter
+from ros_helpers import Ros, wait_until
+from ros_robot import SECOND, SERVICES, STEP, messages
 
 from gsseg_core.data.view import View
 from gsseg_ros.node.inputs import Inputs

@@ -12,11 +12,6 @@ from typing import Any
 
 import numpy as np
 import pytest
-from ros_helpers import PATIENCE, Process, Ros
-from small_scenes import NAMES
-
-pytest.importorskip("gsseg_msgs.msg", reason="gsseg_msgs is not installed")
-
 from diagnostic_msgs.msg import DiagnosticArray
 from geometry_msgs.msg import PoseStamped
 from gsseg_msgs.action import Learn
@@ -39,7 +34,9 @@ from rcl_interfaces.srv import DescribeParameters, GetParameters, ListParameters
 from rclpy.action import ActionClient
 from rclpy.parameter import Parameter, parameter_value_to_python
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
+from ros_helpers import PATIENCE, Process, Ros
 from sensor_msgs.msg import CameraInfo, Image
+from small_scenes import NAMES
 from std_msgs.msg import Header
 
 from gsseg_core.data.view import View

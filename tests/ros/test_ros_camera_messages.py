@@ -8,12 +8,9 @@ from typing import Any
 import numpy as np
 import pycolmap
 import pytest
+from geometry_msgs.msg import Point, Pose, Quaternion, Transform, Vector3
 from hypothesis import given
 from hypothesis import strategies as st
-
-pytest.importorskip("sensor_msgs")
-
-from geometry_msgs.msg import Point, Pose, Quaternion, Transform, Vector3
 from ros_message_cases import HEADER, IDENTITY, K, info, refusal
 from sensor_msgs.msg import CameraInfo, RegionOfInterest
 

@@ -11,26 +11,22 @@ from typing import Any
 
 import numpy as np
 import pytest
+from geometry_msgs.msg import Transform
+from nav_msgs.msg import Odometry
+from pairing_events import expire
 from ros_fixtures import parameters_fixture, root_fixture, scene_fixture, shared_fixture  # noqa: F401
 from ros_helpers import Ros, wait_until
 from ros_node_here import NodeHere, node_here
 from ros_robot import core_session, messages
+from sensor_msgs.msg import Image
 from small_scenes import clean_views
 
 from gsseg_core.data.view import View
+from gsseg_core.errors import SettingsError
 from gsseg_core.raster.backends import make_operator
 from gsseg_core.raster.depth import surface
 from gsseg_core.raster.depth_gating import gate_view
 from gsseg_core.scene.gaussian_scene import GaussianScene
-
-pytest.importorskip("gsseg_msgs.msg", reason="gsseg_msgs is not installed")
-
-from geometry_msgs.msg import Transform
-from nav_msgs.msg import Odometry
-from pairing_events import expire
-from sensor_msgs.msg import Image
-
-from gsseg_core.errors import SettingsError
 from gsseg_ros.conversions import confidence_image, pose_from_matrix
 from gsseg_ros.errors import DepthImageError
 from gsseg_ros.node import diagnostics

@@ -8,7 +8,10 @@ from typing import Any
 
 import numpy as np
 import pytest
+import rclpy
+from gsseg_msgs.action import Learn
 from patience import PATIENCE
+from rclpy.signals import SignalHandlerOptions
 from ros_client_cases import (  # noqa: F401
     FOREVER,
     Background,
@@ -22,12 +25,6 @@ from ros_client_cases import (  # noqa: F401
 from ros_helpers import wait_until
 from scene_files import write_glb, write_gsplat, write_ksplat
 from small_scenes import NAMES, balls_on_a_table, ring
-
-pytest.importorskip("gsseg_msgs.msg", reason="gsseg_msgs is not installed")
-
-import rclpy
-from gsseg_msgs.action import Learn
-from rclpy.signals import SignalHandlerOptions
 
 from gsseg_core.errors import IntrinsicsError, PoseError
 from gsseg_core.export.pictures import palette

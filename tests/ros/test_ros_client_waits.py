@@ -15,6 +15,11 @@ from typing import Any
 
 import numpy as np
 import pytest
+import rclpy
+from builtin_interfaces.msg import Time
+from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
+from gsseg_msgs.msg import SegmentationReport, StageTiming
+from gsseg_msgs.srv import Reset
 from patience import PATIENCE
 from ros_client_cases import (  # noqa: F401
     FOREVER,
@@ -30,16 +35,8 @@ from ros_client_cases import (  # noqa: F401
     start_node,
 )
 from ros_helpers import REPOSITORY, Ros, ros_fixture, wait_until  # noqa: F401
-from small_scenes import write_dataset
-
-pytest.importorskip("gsseg_msgs.msg", reason="gsseg_msgs is not installed")
-
-import rclpy
-from builtin_interfaces.msg import Time
-from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
-from gsseg_msgs.msg import SegmentationReport, StageTiming
-from gsseg_msgs.srv import Reset
 from sensor_msgs.msg import PointCloud2
+from small_scenes import write_dataset
 from std_msgs.msg import Header
 
 from gsseg_ros.client import NodeUnavailableError, SegmentationClient, SegmentationError, calls, connection

@@ -12,9 +12,6 @@ from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 from patience import PATIENCE
-
-pytest.importorskip("sensor_msgs")
-
 from ros_message_cases import HEADER, as_bytes, refusal
 from sensor_msgs.msg import PointCloud2, PointField
 

@@ -8,9 +8,6 @@ from typing import Any
 
 import pytest
 import ros_helpers  # noqa: F401
-
-pytest.importorskip("gsseg_msgs.msg", reason="gsseg_msgs is not installed")
-
 from diagnostic_msgs.msg import DiagnosticStatus
 from rclpy.clock import ROSClock
 from rclpy.time import Time

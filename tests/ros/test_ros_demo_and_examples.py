@@ -18,8 +18,6 @@ from PIL import Image as Picture
 from ros_helpers import REPOSITORY, Process, Ros, ros_fixture, wait_until  # noqa: F401
 from small_scenes import NAMES, write_dataset
 
-pytest.importorskip("gsseg_msgs.msg", reason="gsseg_msgs is not installed")
-
 from gsseg_core.cli.main import main
 from gsseg_core.data.label_images import read_mask
 from gsseg_core.demo.furniture import CLASS_NAMES

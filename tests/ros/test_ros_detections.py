@@ -8,9 +8,6 @@ from typing import Any
 
 import numpy as np
 import pytest
-
-pytest.importorskip("sensor_msgs")
-
 from ros_message_cases import HEADER, refusal
 from sensor_msgs.msg import Image
 

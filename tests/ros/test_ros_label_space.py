@@ -7,9 +7,6 @@ from typing import Any
 
 import numpy as np
 import pytest
-
-pytest.importorskip("sensor_msgs")
-
 from ros_message_cases import refusal
 from small_scenes import balls_on_a_table
 

@@ -9,6 +9,9 @@ from typing import Any
 
 import numpy as np
 import pytest
+from action_msgs.msg import GoalStatus
+from action_msgs.srv import CancelGoal
+from gsseg_msgs.action import Learn
 from mask_writers import sam_json
 from ros_datasets import copied, write_long_dataset
 from ros_helpers import Ros
@@ -23,12 +26,6 @@ from gsseg_core.live.session import LiveSession
 from gsseg_core.refine.settings import UNREFINED
 from gsseg_core.scene.gaussian_scene import GaussianScene
 from gsseg_core.segmentation import REMOVED, Segmentation
-
-pytest.importorskip("gsseg_msgs.msg", reason="gsseg_msgs is not installed")
-
-from action_msgs.msg import GoalStatus
-from action_msgs.srv import CancelGoal
-from gsseg_msgs.action import Learn
 
 LEARNERS = ("em", "votes", "gradient")
 

@@ -7,14 +7,11 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from gsseg_msgs.msg import SceneDelta as SceneDeltaMessage
 from ros_fixtures import root_fixture  # noqa: F401
 from ros_helpers import Ros, ros_fixture  # noqa: F401
 from ros_robot import CLASSES, RELIABLE, Robot
 from small_scenes import NAMES, balls_on_a_table, clean_views
-
-pytest.importorskip("gsseg_msgs.msg", reason="gsseg_msgs is not installed")
-
-from gsseg_msgs.msg import SceneDelta as SceneDeltaMessage
 
 from gsseg_core.learn.learner_state import State
 from gsseg_core.live.living_session import LivingSession

@@ -13,9 +13,6 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
-
-pytest.importorskip("sensor_msgs")
-
 from PIL import Image as Picture
 from ros_message_cases import HEADER, image, refusal
 from sensor_msgs.msg import CompressedImage

@@ -6,16 +6,13 @@ from collections.abc import Iterator
 from typing import Any
 
 import pytest
+from diagnostic_msgs.msg import DiagnosticStatus
 from ros_fixtures import parameters_fixture, root_fixture  # noqa: F401
 from ros_helpers import Ros
 from ros_robot import RELIABLE, SECOND, STEP, Robot, messages, private_ros
-from small_scenes import clean_views
-
-pytest.importorskip("gsseg_msgs.msg", reason="gsseg_msgs is not installed")
-
-from diagnostic_msgs.msg import DiagnosticStatus
 from rosgraph_msgs.msg import Clock
 from sensor_msgs.msg import PointCloud2
+from small_scenes import clean_views
 
 from gsseg_ros.conversions import stamp_message, stamp_ns
 

@@ -10,18 +10,15 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from ros_fixtures import node_fixture, parameters_fixture, root_fixture  # noqa: F401
-from ros_helpers import Ros, ros_fixture  # noqa: F401
-from ros_robot import SECOND, Robot, private_ros
-from small_scenes import NUM_CLASSES, clean_views
-
-pytest.importorskip("gsseg_msgs.msg", reason="gsseg_msgs is not installed")
-
 from diagnostic_msgs.msg import DiagnosticStatus
 from lifecycle_msgs.msg import State
 from rclpy.lifecycle import LifecycleNode, TransitionCallbackReturn
 from rclpy.qos import DurabilityPolicy, ReliabilityPolicy
+from ros_fixtures import node_fixture, parameters_fixture, root_fixture  # noqa: F401
+from ros_helpers import Ros, ros_fixture  # noqa: F401
+from ros_robot import SECOND, Robot, private_ros
 from sensor_msgs.msg import Image
+from small_scenes import NUM_CLASSES, clean_views
 
 from gsseg_ros.node.segment_node import SegmentNode
 

@@ -24,9 +24,6 @@ from small_scenes import clean_views
 from gsseg_core.data.dataset import Dataset
 from gsseg_core.scene.gaussian_scene import GaussianScene
 from gsseg_core.segmentation import Segmentation
-
-pytest.importorskip("gsseg_msgs.msg", reason="gsseg_msgs is not installed")
-
 from gsseg_ros.node import segment_node
 from gsseg_ros.node.node_executor import NodeExecutor
 from gsseg_ros.node.segment_node import SegmentNode

@@ -12,18 +12,15 @@ from typing import Any
 
 import numpy as np
 import pytest
+from action_msgs.msg import GoalStatus
+from geometry_msgs.msg import Point, Pose, PoseStamped, Quaternion
 from patience import PATIENCE
+from rclpy.parameter import Parameter
 from ros_checks import limited
 from ros_fixtures import parameters_fixture, root_fixture, shared_fixture, spun  # noqa: F401
 from ros_helpers import Ros
 from ros_robot import CLASSES, SERVICES, Goal, Learn, Robot, core_session, private_ros, viewpoint
 from small_scenes import build, clean_views
-
-pytest.importorskip("gsseg_msgs.msg", reason="gsseg_msgs is not installed")
-
-from action_msgs.msg import GoalStatus
-from geometry_msgs.msg import Point, Pose, PoseStamped, Quaternion
-from rclpy.parameter import Parameter
 
 from gsseg_ros.errors import PathNotAllowedError
 from gsseg_ros.node import segment_node, services

@@ -6,15 +6,12 @@ from types import SimpleNamespace
 from typing import Any
 
 import pytest
-from ros_fixtures import node_fixture, parameters_fixture, root_fixture  # noqa: F401
-from ros_helpers import PATIENCE, Ros, ros_fixture  # noqa: F401
-from ros_robot import CLASSES, RELIABLE
-
-pytest.importorskip("gsseg_msgs.msg", reason="gsseg_msgs is not installed")
-
 from rcl_interfaces.srv import GetParameters
 from rclpy.lifecycle import TransitionCallbackReturn
 from rclpy.qos import QoSProfile, ReliabilityPolicy
+from ros_fixtures import node_fixture, parameters_fixture, root_fixture  # noqa: F401
+from ros_helpers import PATIENCE, Ros, ros_fixture  # noqa: F401
+from ros_robot import CLASSES, RELIABLE
 from sensor_msgs.msg import PointCloud2
 
 from gsseg_ros.node.node_executor import NodeExecutor

@@ -8,6 +8,10 @@ from typing import Any
 
 import numpy as np
 import pytest
+from action_msgs.msg import GoalStatus
+from gsseg_msgs.action import Learn
+from gsseg_msgs.msg import ObjectArray, SegmentationReport
+from gsseg_msgs.srv import Segment
 from parts_of_balls import views_in_halves
 from per_view_ids import in_halves
 from ros_fixtures import running_fixture, shared_fixture  # noqa: F401
@@ -19,14 +23,6 @@ from small_scenes import balls_on_a_table, clean_views, write_dataset
 from gsseg_core.data.view import View
 from gsseg_core.live.per_view_session import PerViewSession
 from gsseg_core.segmentation import Segmentation
-
-pytest.importorskip("gsseg_msgs.msg", reason="gsseg_msgs is not installed")
-
-from action_msgs.msg import GoalStatus
-from gsseg_msgs.action import Learn
-from gsseg_msgs.msg import ObjectArray, SegmentationReport
-from gsseg_msgs.srv import Segment
-
 from gsseg_ros.node.services import Services
 from gsseg_ros.node.workspace import Run
 

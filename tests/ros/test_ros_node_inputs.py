@@ -7,26 +7,22 @@ from typing import Any
 
 import numpy as np
 import pytest
+from nav_msgs.msg import Odometry
 from ros_fixtures import parameters_fixture, root_fixture, scene_fixture, shared_fixture  # noqa: F401
 from ros_helpers import Ros, ros_fixture  # noqa: F401
 from ros_robot import SECOND, STEP, Robot, assert_same, core_session, messages, renamed
+from sensor_msgs.msg import PointCloud2
 from small_scenes import clean_views, look_at
+from std_msgs.msg import Header
 
 from gsseg_core.data.dataset import Dataset
 from gsseg_core.data.view import View
 from gsseg_core.refine.settings import UNREFINED
 from gsseg_core.scene.gaussian_scene import GaussianScene
 from gsseg_core.segmentation import Segmentation
-from gsseg_ros.frames import Similarity
-
-pytest.importorskip("gsseg_msgs.msg", reason="gsseg_msgs is not installed")
-
-from nav_msgs.msg import Odometry
-from sensor_msgs.msg import PointCloud2
-from std_msgs.msg import Header
-
 from gsseg_ros.camera_infos import camera_of_image
 from gsseg_ros.conversions import arrays_from_cloud, mask_image, pose_from_matrix, stamp_message
+from gsseg_ros.frames import Similarity
 
 
 @pytest.fixture(scope="module")

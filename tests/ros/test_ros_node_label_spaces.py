@@ -11,21 +11,17 @@ from typing import Any
 
 import numpy as np
 import pytest
+from rclpy.lifecycle import TransitionCallbackReturn
+from rclpy.parameter import Parameter
 from ros_fixtures import parameters_fixture, root_fixture, scene_fixture, shared_fixture, spun  # noqa: F401
 from ros_helpers import Ros, wait_until
 from ros_node_here import NodeHere, node_here
 from ros_robot import LATCHED, core_session, messages
+from sensor_msgs.msg import CameraInfo
 from small_scenes import clean_views
 
 from gsseg_core.data.view import View
 from gsseg_core.scene.gaussian_scene import GaussianScene
-
-pytest.importorskip("gsseg_msgs.msg", reason="gsseg_msgs is not installed")
-
-from rclpy.lifecycle import TransitionCallbackReturn
-from rclpy.parameter import Parameter
-from sensor_msgs.msg import CameraInfo
-
 from gsseg_ros.conversions import mask_image
 from gsseg_ros.node import inputs
 from gsseg_ros.node.masks import label_info

@@ -7,15 +7,12 @@ from typing import Any
 
 import numpy as np
 import pytest
+from action_msgs.msg import GoalStatus
+from gsseg_msgs.action import Learn
 from ros_fixtures import idle_fixture, idle_robot_fixture, parameters_fixture, root_fixture, shared_fixture  # noqa: F401
 from ros_helpers import Ros, ros_fixture  # noqa: F401
 from ros_robot import SERVICES, Robot
 from small_scenes import clean_views
-
-pytest.importorskip("gsseg_msgs.msg", reason="gsseg_msgs is not installed")
-
-from action_msgs.msg import GoalStatus
-from gsseg_msgs.action import Learn
 
 REQUESTS = ("segment", "pick", "render_view", "load_scene", "save_state", "load_state", "export", "reset")
 

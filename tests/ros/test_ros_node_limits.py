@@ -8,15 +8,12 @@ from typing import Any
 
 import numpy as np
 import pytest
+from gsseg_msgs.srv import RenderView, Segment
 from patience import PATIENCE
 from ros_fixtures import node_fixture, parameters_fixture, root_fixture, spun  # noqa: F401
 from ros_helpers import Ros, ros_fixture  # noqa: F401
 from ros_robot import Robot, viewpoint
 from small_scenes import clean_views
-
-pytest.importorskip("gsseg_msgs.msg", reason="gsseg_msgs is not installed")
-
-from gsseg_msgs.srv import RenderView, Segment
 
 from gsseg_core.data.view import View
 from gsseg_core.scene.camera import Camera

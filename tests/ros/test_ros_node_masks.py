@@ -10,20 +10,16 @@ from typing import Any
 import numpy as np
 import pytest
 from PIL import Image as Picture
+from rclpy.node import Node
 from ros_fixtures import parameters_fixture, root_fixture, scene_fixture, shared_fixture  # noqa: F401
 from ros_helpers import Ros, ros_fixture, wait_until  # noqa: F401
 from ros_node_here import NodeHere, node_here
 from ros_robot import core_session, messages
+from sensor_msgs.msg import CompressedImage, Image
 from small_scenes import clean_views
 
 from gsseg_core.data.view import View
 from gsseg_core.scene.gaussian_scene import GaussianScene
-
-pytest.importorskip("gsseg_msgs.msg", reason="gsseg_msgs is not installed")
-
-from rclpy.node import Node
-from sensor_msgs.msg import CompressedImage, Image
-
 from gsseg_ros.conversions import plain_image, rgb_image
 from gsseg_ros.node.masks.compressed import compressed_topic
 

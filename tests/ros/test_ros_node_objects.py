@@ -6,25 +6,21 @@ from typing import Any
 
 import numpy as np
 import pytest
+from gsseg_msgs.msg import Object, ObjectArray
 from ros_fixtures import parameters_fixture, root_fixture, running_fixture, scene_fixture, shared_fixture  # noqa: F401
 from ros_helpers import Ros, ros_fixture  # noqa: F401
 from ros_robot import LATCHED, Robot, core_session
 from small_scenes import clean_views
+from visualization_msgs.msg import Marker, MarkerArray
 
 from gsseg_core.export.pictures import palette
 from gsseg_core.objects.oriented_boxes import object_boxes
 from gsseg_core.refine.settings import PAPER, UNREFINED
+from gsseg_core.scene.camera import rigid_motion
 from gsseg_core.scene.gaussian_scene import GaussianScene
 from gsseg_core.segmentation import Segmentation
-from gsseg_ros.frames import Similarity
-
-pytest.importorskip("gsseg_msgs.msg", reason="gsseg_msgs is not installed")
-
-from gsseg_msgs.msg import Object, ObjectArray
-from visualization_msgs.msg import Marker, MarkerArray
-
-from gsseg_core.scene.camera import rigid_motion
 from gsseg_ros.conversions import pose_from_matrix
+from gsseg_ros.frames import Similarity
 from gsseg_ros.node.live_outputs import OBJECTS_PERIOD
 from gsseg_ros.object_messages import box_from_object
 

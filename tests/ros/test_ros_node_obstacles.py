@@ -12,23 +12,19 @@ from typing import Any
 import numpy as np
 import pytest
 import yaml
+from rclpy.parameter import Parameter
+from rclpy.qos import DurabilityPolicy, ReliabilityPolicy, qos_profile_sensor_data
 from ros_fixtures import parameters_fixture, root_fixture, scene_fixture, shared_fixture  # noqa: F401
 from ros_helpers import REPOSITORY, Node, Ros, private_context
 from ros_node_here import NodeHere, node_here
 from ros_robot import core_session
+from sensor_msgs.msg import PointCloud2
 from small_scenes import clean_views
 
 from gsseg_core.objects.occupied_cells import occupied_cells
 from gsseg_core.refine.settings import PAPER
 from gsseg_core.scene.gaussian_scene import GaussianScene
 from gsseg_core.scene.quaternions import rotations
-
-pytest.importorskip("gsseg_msgs.msg", reason="gsseg_msgs is not installed")
-
-from rclpy.parameter import Parameter
-from rclpy.qos import DurabilityPolicy, ReliabilityPolicy, qos_profile_sensor_data
-from sensor_msgs.msg import PointCloud2
-
 from gsseg_ros.node import declarations, segment_node
 from gsseg_ros.node import obstacles as obstacles_module
 from gsseg_ros.node.parameters import Settings

@@ -10,11 +10,15 @@ from typing import Any
 
 import numpy as np
 import pytest
+from builtin_interfaces.msg import Time
+from gsseg_msgs.msg import ObjectArray
 from patience import PATIENCE
 from ros_fixtures import parameters_fixture, root_fixture, running_fixture, scene_fixture, shared_fixture  # noqa: F401
 from ros_helpers import wait_until
 from ros_robot import CLASSES, LATCHED, Robot, core_session, messages
+from sensor_msgs.msg import Image
 from small_scenes import balls_on_a_table, clean_views
+from std_msgs.msg import Header
 
 from gsseg_core.data.view import View
 from gsseg_core.errors import MaskFormatError
@@ -24,14 +28,6 @@ from gsseg_core.raster.backends import make_operator
 from gsseg_core.refine.settings import UNREFINED
 from gsseg_core.scene.camera import Camera
 from gsseg_core.scene.gaussian_scene import GaussianScene
-
-pytest.importorskip("gsseg_msgs.msg", reason="gsseg_msgs is not installed")
-
-from builtin_interfaces.msg import Time
-from gsseg_msgs.msg import ObjectArray
-from sensor_msgs.msg import Image
-from std_msgs.msg import Header
-
 from gsseg_ros.conversions import color_from_image, picture_from_image, rgb_image
 from gsseg_ros.frames import Similarity
 from gsseg_ros.node import live_outputs

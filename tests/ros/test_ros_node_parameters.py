@@ -7,16 +7,13 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from rcl_interfaces.msg import Parameter as ParameterMessage
+from rcl_interfaces.msg import ParameterType
+from rclpy.parameter import Parameter, get_parameter_value
 from ros_fixtures import idle_fixture, idle_robot_fixture, parameters_fixture, root_fixture, shared_fixture  # noqa: F401
 from ros_helpers import REPOSITORY, Ros, ros_fixture  # noqa: F401
 from ros_robot import CLASSES, Robot
 from small_scenes import clean_views
-
-pytest.importorskip("gsseg_msgs.msg", reason="gsseg_msgs is not installed")
-
-from rcl_interfaces.msg import Parameter as ParameterMessage
-from rcl_interfaces.msg import ParameterType
-from rclpy.parameter import Parameter, get_parameter_value
 
 from gsseg_ros.node.declarations import AT_ONCE, DECLARATIONS
 from gsseg_ros.node.parameters import Settings, check

@@ -8,26 +8,22 @@ from typing import Any
 
 import numpy as np
 import pytest
+from geometry_msgs.msg import Point
+from gsseg_msgs.msg import Object
 from ros_fixtures import parameters_fixture, root_fixture, scene_fixture, shared_fixture  # noqa: F401
 from ros_helpers import Ros
 from ros_node_here import NodeHere, node_here
 from ros_robot import SERVICES, messages, viewpoint
 from small_scenes import clean_views
+from std_msgs.msg import Header
 
 from gsseg_core.data.view import View
 from gsseg_core.objects.oriented_boxes import class_box
 from gsseg_core.objects.pick import Pick, pick_clicks, pick_mask
 from gsseg_core.scene.gaussian_scene import GaussianScene
-from gsseg_ros.frames import Similarity
-
-pytest.importorskip("gsseg_msgs.msg", reason="gsseg_msgs is not installed")
-
-from geometry_msgs.msg import Point
-from gsseg_msgs.msg import Object
-from std_msgs.msg import Header
-
 from gsseg_ros.camera_infos import camera_of_image
 from gsseg_ros.conversions import arrays_from_cloud, mask_image
+from gsseg_ros.frames import Similarity
 from gsseg_ros.node import segment_node
 from gsseg_ros.object_messages import box_from_object
 

@@ -10,21 +10,17 @@ from typing import Any
 
 import numpy as np
 import pytest
+from diagnostic_msgs.msg import DiagnosticStatus
+from gsseg_msgs.msg import SegmentationReport
+from gsseg_msgs.srv import Segment
 from ros_fixtures import parameters_fixture, root_fixture, shared_fixture  # noqa: F401
 from ros_helpers import Ros, ros_fixture  # noqa: F401
 from ros_robot import SECOND, STEP, Robot, messages
 from small_scenes import balls_on_a_table, clean_views, look_at, true_labels
+from std_msgs.msg import Header
 
 from gsseg_core.data.view import View
 from gsseg_core.segmentation import Segmentation
-
-pytest.importorskip("gsseg_msgs.msg", reason="gsseg_msgs is not installed")
-
-from diagnostic_msgs.msg import DiagnosticStatus
-from gsseg_msgs.msg import SegmentationReport
-from gsseg_msgs.srv import Segment
-from std_msgs.msg import Header
-
 from gsseg_ros.conversions import mask_image, pose_from_matrix, stamp_message, stamp_ns
 
 Messages = dict[str, Any]

@@ -9,11 +9,15 @@ from unittest.mock import MagicMock
 
 import numpy as np
 import pytest
+from gsseg_msgs.action import Learn
+from gsseg_msgs.msg import ObjectArray, SegmentationReport
 from patience import PATIENCE
+from rclpy.parameter import Parameter
 from ros_fixtures import parameters_fixture, root_fixture, scene_fixture, shared_fixture  # noqa: F401
 from ros_helpers import Ros, wait_until
 from ros_node_here import NodeHere, node_here
 from ros_robot import IDENTITY, LATCHED, SECOND, SERVICES, Robot, core_session, messages, renamed, viewpoint
+from sensor_msgs.msg import Image, PointCloud2
 from small_scenes import clean_views
 
 from gsseg_core.data.view import View
@@ -21,13 +25,6 @@ from gsseg_core.scene.gaussian_scene import GaussianScene
 from gsseg_ros.frames import Similarity
 from gsseg_ros.node import inputs, segment_node
 from gsseg_ros.node.matched_subscription import MatchedSubscription
-
-pytest.importorskip("gsseg_msgs.msg", reason="gsseg_msgs is not installed")
-
-from gsseg_msgs.action import Learn
-from gsseg_msgs.msg import ObjectArray, SegmentationReport
-from rclpy.parameter import Parameter
-from sensor_msgs.msg import Image, PointCloud2
 
 CHANGES = ("load_scene", "reset", "load_state")
 

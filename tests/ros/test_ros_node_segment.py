@@ -7,9 +7,12 @@ from typing import Any
 
 import numpy as np
 import pytest
+from gsseg_msgs.msg import ObjectArray, SegmentationReport
+from gsseg_msgs.srv import Export, Segment
 from ros_checks import TOKENS, counts, latched_clouds
 from ros_fixtures import parameters_fixture, root_fixture, running_fixture, scene_fixture, shared_fixture  # noqa: F401
 from ros_robot import CLASSES, LATCHED, SERVICES, Learn, Robot, core_session, viewpoint
+from sensor_msgs.msg import Image, PointCloud2
 from small_scenes import NAMES, clean_views
 
 from gsseg_core.export.pictures import overlay, palette
@@ -18,13 +21,6 @@ from gsseg_core.raster.backends import make_operator
 from gsseg_core.refine.settings import PAPER, RefineSettings
 from gsseg_core.scene.gaussian_scene import GaussianScene
 from gsseg_core.segmentation import REMOVED, Segmentation
-
-pytest.importorskip("gsseg_msgs.msg", reason="gsseg_msgs is not installed")
-
-from gsseg_msgs.msg import ObjectArray, SegmentationReport
-from gsseg_msgs.srv import Export, Segment
-from sensor_msgs.msg import Image, PointCloud2
-
 from gsseg_ros.conversions import arrays_from_cloud, labels_from_image
 from gsseg_ros.node.request_fields import refinement
 

@@ -9,6 +9,9 @@ from typing import Any
 import numpy as np
 import plyfile
 import pytest
+from action_msgs.msg import GoalStatus
+from gsseg_msgs.msg import SceneDelta as SceneDeltaMessage
+from gsseg_msgs.msg import SegmentationReport
 from ros_checks import counts, latched_clouds, limited
 from ros_fixtures import parameters_fixture, root_fixture, running_fixture, scene_fixture, shared_fixture  # noqa: F401
 from ros_robot import CLASSES, RELIABLE, SERVICES, Robot, assert_same, core_session, viewpoint
@@ -20,13 +23,6 @@ from gsseg_core.data.view import View
 from gsseg_core.scene.gaussian_scene import GaussianScene
 from gsseg_core.scene.scene_delta import SceneDelta
 from gsseg_core.segmentation import Segmentation
-
-pytest.importorskip("gsseg_msgs.msg", reason="gsseg_msgs is not installed")
-
-from action_msgs.msg import GoalStatus
-from gsseg_msgs.msg import SceneDelta as SceneDeltaMessage
-from gsseg_msgs.msg import SegmentationReport
-
 from gsseg_ros.delta_messages import message_from_delta
 
 

@@ -8,17 +8,14 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from ros_fixtures import node_fixture, parameters_fixture, root_fixture, spun  # noqa: F401
-from ros_helpers import Ros, ros_fixture, wait_until  # noqa: F401
-from ros_robot import Robot
-from small_scenes import clean_views
-
-pytest.importorskip("gsseg_msgs.msg", reason="gsseg_msgs is not installed")
-
 from lifecycle_msgs.msg import Transition
 from rclpy.lifecycle import TransitionCallbackReturn
 from rclpy.node import Node
 from rclpy.parameter import Parameter
+from ros_fixtures import node_fixture, parameters_fixture, root_fixture, spun  # noqa: F401
+from ros_helpers import Ros, ros_fixture, wait_until  # noqa: F401
+from ros_robot import Robot
+from small_scenes import clean_views
 
 from gsseg_ros.node import diagnostics, segment_node
 from gsseg_ros.node.scene_frame import SceneFrame

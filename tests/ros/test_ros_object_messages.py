@@ -5,17 +5,13 @@ from __future__ import annotations
 import numpy as np
 import pytest
 import ros_helpers  # noqa: F401
-
-from gsseg_core.errors import PoseError
-from gsseg_core.objects.oriented_boxes import OrientedBox
-from gsseg_ros.frames import rotation_from_quaternion
-
-pytest.importorskip("gsseg_msgs.msg", reason="gsseg_msgs is not installed")
-
 from gsseg_msgs.msg import Object, ObjectArray
 from std_msgs.msg import ColorRGBA, Header
 from visualization_msgs.msg import Marker
 
+from gsseg_core.errors import PoseError
+from gsseg_core.objects.oriented_boxes import OrientedBox
+from gsseg_ros.frames import rotation_from_quaternion
 from gsseg_ros.object_messages import THINNEST, box_from_object, object_markers, object_message
 
 TURN = rotation_from_quaternion(0.1, 0.5, -0.3, 0.8)

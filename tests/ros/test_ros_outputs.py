@@ -16,16 +16,13 @@ from typing import Any
 
 import numpy as np
 import pytest
+from gsseg_msgs.msg import ObjectArray, SegmentationReport
 from patience import PATIENCE
+from rclpy.lifecycle import LifecycleNode
 from ros_fixtures import shared_fixture  # noqa: F401
 from ros_helpers import Ros
-from small_scenes import NAMES, NUM_CLASSES, balls_on_a_table, clean_views
-
-pytest.importorskip("gsseg_msgs.msg", reason="gsseg_msgs is not installed")
-
-from gsseg_msgs.msg import ObjectArray, SegmentationReport
-from rclpy.lifecycle import LifecycleNode
 from sensor_msgs.msg import Image
+from small_scenes import NAMES, NUM_CLASSES, balls_on_a_table, clean_views
 from std_msgs.msg import Header
 
 from gsseg_core.export.pictures import palette

@@ -11,13 +11,19 @@ from typing import Any
 
 import numpy as np
 import pytest
+from geometry_msgs.msg import Point, Pose, Quaternion
+from gsseg_msgs.msg import ObjectArray, SegmentationReport
 from hypothesis import given
 from hypothesis import strategies as st
 from patience import PATIENCE
+from rcl_interfaces.msg import SetParametersResult
+from rclpy.lifecycle import TransitionCallbackReturn
+from rclpy.parameter import Parameter
 from ros_fixtures import parameters_fixture, root_fixture, scene_fixture, shared_fixture  # noqa: F401
 from ros_helpers import Ros, wait_until
 from ros_node_here import node_here
 from ros_robot import CLASSES, IDENTITY, LATCHED, core_session, messages
+from sensor_msgs.msg import PointCloud2
 from small_scenes import balls_on_a_table, clean_views
 
 from gsseg_core.data.view import View
@@ -26,16 +32,6 @@ from gsseg_core.live.living_session import LivingSession
 from gsseg_core.live.per_view_session import PerViewSession
 from gsseg_core.refine.settings import UNREFINED
 from gsseg_core.scene.gaussian_scene import GaussianScene
-
-pytest.importorskip("gsseg_msgs.msg", reason="gsseg_msgs is not installed")
-
-from geometry_msgs.msg import Point, Pose, Quaternion
-from gsseg_msgs.msg import ObjectArray, SegmentationReport
-from rcl_interfaces.msg import SetParametersResult
-from rclpy.lifecycle import TransitionCallbackReturn
-from rclpy.parameter import Parameter
-from sensor_msgs.msg import PointCloud2
-
 from gsseg_core.scene.group_frames import is_same
 from gsseg_core.scene.scene_delta import GroupMove, SceneDelta
 from gsseg_core.scene.similarity import Similarity as CoreSimilarity

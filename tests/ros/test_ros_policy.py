@@ -6,15 +6,11 @@ from fnmatch import fnmatch
 from pathlib import Path
 from xml.etree import ElementTree
 
-import pytest
 from patience import PATIENCE
+from rclpy.action import get_action_client_names_and_types_by_node, get_action_server_names_and_types_by_node
 from ros_client_cases import says_in_the_end
 from ros_helpers import REPOSITORY, Ros, ros_fixture  # noqa: F401
 from small_scenes import balls_on_a_table, write_dataset
-
-pytest.importorskip("gsseg_msgs.msg", reason="gsseg_msgs is not installed")
-
-from rclpy.action import get_action_client_names_and_types_by_node, get_action_server_names_and_types_by_node
 
 from gsseg_core.scene.gaussian_scene import GaussianScene
 from gsseg_ros.client import SegmentationClient

@@ -13,6 +13,9 @@ from typing import Any
 
 import numpy as np
 import pytest
+from builtin_interfaces.msg import Time
+from diagnostic_msgs.msg import DiagnosticStatus
+from gsseg_msgs.msg import SceneDelta as SceneDeltaMessage
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from patience import PATIENCE
@@ -22,12 +25,6 @@ from ros_node_here import NodeHere, node_here
 from ros_robot import SECOND
 from scipy.spatial.transform import Rotation
 from small_scenes import balls_on_a_table, clean_views, write_dataset
-
-pytest.importorskip("gsseg_msgs.msg", reason="gsseg_msgs is not installed")
-
-from builtin_interfaces.msg import Time
-from diagnostic_msgs.msg import DiagnosticStatus
-from gsseg_msgs.msg import SceneDelta as SceneDeltaMessage
 
 from gsseg_core.data.dataset import Dataset
 from gsseg_core.live.living_session import Changed, LivingSession

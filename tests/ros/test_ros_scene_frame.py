@@ -8,9 +8,6 @@ from typing import Any
 
 import numpy as np
 import pytest
-
-pytest.importorskip("gsseg_msgs.msg", reason="gsseg_msgs is not installed")
-
 from builtin_interfaces.msg import Time
 
 from gsseg_ros.conversions import matrix_from_transform

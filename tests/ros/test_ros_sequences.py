@@ -7,14 +7,6 @@ from types import SimpleNamespace
 from typing import Any
 
 import pytest
-from ros_fixtures import parameters_fixture, root_fixture  # noqa: F401
-from ros_helpers import Ros, ros_fixture, wait_until  # noqa: F401
-from ros_node_here import NodeHere, node_here
-from ros_robot import LATCHED
-from small_scenes import clean_views, lost_half_way
-
-pytest.importorskip("gsseg_msgs.msg", reason="gsseg_msgs is not installed")
-
 from geometry_msgs.msg import PoseStamped
 from gsseg_msgs.action import Learn
 from gsseg_msgs.msg import ObjectArray
@@ -22,7 +14,12 @@ from nav_msgs.msg import Odometry
 from rclpy.action.server import GoalResponse
 from rclpy.parameter import Parameter
 from rclpy.qos import QoSProfile, ReliabilityPolicy
+from ros_fixtures import parameters_fixture, root_fixture  # noqa: F401
+from ros_helpers import Ros, ros_fixture, wait_until  # noqa: F401
+from ros_node_here import NodeHere, node_here
+from ros_robot import LATCHED
 from sensor_msgs.msg import PointCloud2
+from small_scenes import clean_views, lost_half_way
 
 from gsseg_ros.node import diagnostics, live_outputs, services
 from gsseg_ros.node.masks.detections import ADAPTERS, Adapter

@@ -8,15 +8,12 @@ from typing import Any
 
 import numpy as np
 import pytest
+from builtin_interfaces.msg import Time
 from labellings import probabilities_of
 from patience import PATIENCE
 from ros_helpers import Ros, ros_fixture, wait_until  # noqa: F401
-from small_scenes import NAMES, many_classes, write_dataset
-
-pytest.importorskip("gsseg_msgs.msg", reason="gsseg_msgs is not installed")
-
-from builtin_interfaces.msg import Time
 from sensor_msgs.msg import PointCloud2
+from small_scenes import NAMES, many_classes, write_dataset
 from std_msgs.msg import Header
 
 from gsseg_core.errors import SettingsError, StateMismatchError

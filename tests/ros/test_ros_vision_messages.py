@@ -12,12 +12,9 @@ from types import ModuleType, SimpleNamespace
 from typing import Any
 
 import pytest
-from ros_helpers import Context  # noqa: F401 - skips where ROS is not installed.
-
-pytest.importorskip("gsseg_msgs.msg", reason="gsseg_msgs is not installed")
-
 from geometry_msgs.msg import Point, Pose, PoseWithCovariance, Vector3
 from gsseg_msgs.msg import Object, ObjectArray
+from ros_helpers import Context  # noqa: F401 - skips where ROS is not installed.
 from std_msgs.msg import Header
 
 from gsseg_ros.node.outputs import Outputs
