@@ -63,8 +63,11 @@ class Answer:
                     self._answer.content = told
 
     def show_progress(self, stage: str, done: int, total: int) -> None:
-        """Say how far a long job is."""
-        self._answer.content = paragraph(f"{stage}: {done} of {total} views" if done < total else _ASK)
+        """Say how far a long job is, below what was clicked."""
+        with self._state.lock:
+            told = self._told(*self._picked) if self._picked else ""
+            progress = paragraph(f"{stage}: {done} of {total} views") if done < total else ""
+            self._answer.content = told + progress or paragraph(_ASK)
 
     @contextmanager
     def telling(self, client: viser.ClientHandle | None, in_place: bool = True) -> Iterator[None]:

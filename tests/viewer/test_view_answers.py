@@ -81,6 +81,16 @@ def test_an_earlier_click_says_nothing_any_more_once_a_later_one_is_answered(vie
     assert "That did not work" in answer._answer.content and not answer._parts.visible
 
 
+def test_what_was_clicked_is_told_while_the_votes_of_the_views_are_collected(viewer: Viewer) -> None:
+    answer = viewer.panel.answer
+    answer.show_picked(answer.ask(), Picked(IN_BALL, 0.5))
+    told = answer._answer.content
+    answer.show_progress("collect the votes", 1, 2)
+    assert answer._answer.content.startswith(told) and "collect the votes: 1 of 2 views" in answer._answer.content
+    answer.show_progress("collect the votes", 2, 2)
+    assert answer._answer.content == told
+
+
 def test_a_click_is_answered_without_the_views_once_a_mask_cannot_be_read(tmp_path: Path) -> None:
     data = write_dataset(tmp_path / "data")
     views = Dataset(data).views("train")
