@@ -25,11 +25,11 @@ from doc_commands import Started, check, core_libraries, kind_of, run_commands, 
 
 from gsseg_core.cli.arguments import COMMANDS, command_module
 from gsseg_core.data.dataset import Dataset
-from gsseg_ros.child_nodes import NODES
 
 MOST_NOT_RUN = 7
+HAS_ROS = all(map(importlib.util.find_spec, ("rclpy", "gsseg_msgs")))
 PROGRAMS = {
-    "gsseg": "gsseg_core.cli", **NODES,
+    "gsseg": "gsseg_core.cli", **(importlib.import_module("gsseg_ros.child_nodes").NODES if HAS_ROS else {}),
     "dask": "dask", "python": "", "python3": "",
 }  # fmt: skip
 MASKS = "docs/masks.md"
