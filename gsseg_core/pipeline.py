@@ -47,75 +47,32 @@ PICTURED_VIEWS = 12  # views that `segment` draws, spread evenly over the datase
 
 
 def segment(
-    scene_path: str | os.PathLike[str],
-    data: str | os.PathLike[str],
-    out: str | os.PathLike[str],
+    scene_path: str | os.PathLike[str],  # of any format in `gsseg_core.scene.scene_formats`
+    data: str | os.PathLike[str],  # folder of the dataset
+    out: str | os.PathLike[str],  # gets `segmentation.npz`, `classes/`, `pictures/`, `report.html` and `report.json`
     *,
-    labels: str | os.PathLike[str] = "labels",
-    learner: str = "em",
-    views: int | None = None,
-    refine: RefineSettings | None = None,
-    graph: bool = True,
+    labels: str | os.PathLike[str] = "labels",  # sub-folder of masks, or those of another program: docs/formats.md
+    learner: str = "em",  # one of `LEARNERS`
+    views: int | None = None,  # learn from so many train views, spread evenly; from all by default
+    refine: RefineSettings | None = None,  # KNN clustering and carving by default
+    graph: bool = True,  # where views are few, propagate labels: `gsseg_core.refine.label_propagation`
     device: str = "cpu",
-    memory_budget: int | None = None,
+    memory_budget: int | None = None,  # bytes of prepared views; an eighth of what is free by default: docs/memory.md
     seed: int = 0,
-    scheduler: str | None = None,
-    ids: str | None = None,
-    granularity: float | None = None,
-    scene_format: str = DEFAULT_FORMAT,
-    collision: str | None = None,
-    label_map: str | os.PathLike[str] | None = None,
-    align: bool = False,
+    scheduler: str | None = None,  # address of a Dask scheduler whose workers learn; everything else is done here
+    ids: str | None = None,  # one of `IDS`; by default, as the format of the masks has it
+    granularity: float | None = None,  # where the tree of objects is cut for `classes/` and `pictures/`: docs/ids.md
+    scene_format: str = DEFAULT_FORMAT,  # of the files in `classes/`, one of `SCENE_WRITERS`
+    collision: str | None = None,  # kind of meshes of each object, one of `gsseg_core.export.collision.KINDS`
+    label_map: str | os.PathLike[str] | None = None,  # renames, merges and ignores classes: `gsseg_core.data.label_map`
+    align: bool = False,  # as for `gsseg_core.align.placing.place`, with `dataparser`: docs/frames.md
     dataparser: str | os.PathLike[str] | None = None,
-    quality: str = "full",
+    quality: str = "full",  # one of `QUALITIES`: of which pixels of the views to learn: docs/memory.md
     progress: Progress = silent,
 ) -> dict[str, Any]:
-    """Learn from the train views of a dataset, refine, and write everything into `out`.
+    """Learn from train views of a dataset, refine, and write everything into `out`; return what `report.json` holds.
 
-    Parameters
-    ----------
-    scene_path, data : path
-        A scene of any format in `gsseg_core.scene.scene_formats`, and the folder of the dataset.
-    out : path
-        Gets `segmentation.npz`, `classes/`, `pictures/`, and at last `report.html` and `report.json`.
-    labels, label_map : path
-        The masks: their sub-folder of the dataset, or a file or folder of another program, see docs/formats.md; and
-        what renames, merges and ignores classes of them, see `gsseg_core.data.label_map`.
-    learner, quality : str
-        One of `LEARNERS`; and one of `QUALITIES`: of which pixels of the views to learn, see docs/memory.md.
-    views : int, optional
-        Learn from this many train views, spread evenly; from all by default.
-    refine : RefineSettings, optional
-        KNN clustering and carving by default.
-    graph : bool
-        Where views are few, let class probabilities spread to Gaussians that few or no pixels saw, before
-        refinement; see `gsseg_core.refine.label_propagation`.
-    memory_budget : int, optional
-        Bytes of prepared views to keep in memory between the steps of learning, an eighth of what is free by default;
-        see docs/memory.md.
-    scheduler : str, optional
-        Address of a Dask scheduler whose workers learn; everything else is done here.
-    ids : str, optional
-        One of `IDS`: whether an id means the same in every view, or the objects are to be found; by default, as the
-        format of the masks has it.
-    granularity : float, optional
-        Of these objects, in [0, 1]: where the tree of parts and wholes is cut for what is written into `classes/` and
-        `pictures/`; the objects by default. See docs/ids.md.
-    scene_format, collision : str
-        Of the files in `classes/`, one of `SCENE_WRITERS`, see docs/formats.md; and kind of meshes to collide with for
-        each object, one of `gsseg_core.export.collision.KINDS`, none by default.
-    align, dataparser
-        Where the cameras are in the scene, as for `gsseg_core.align.placing.place`; see docs/frames.md.
-
-    Returns
-    -------
-    dict
-        What `report.json` holds.
-
-    Raises
-    ------
-    GssegError
-        Whatever is wrong with the input; see `gsseg_core.errors`. What was in `out` before is whole and unchanged.
+    Raises `GssegError` for whatever is wrong with the input; what was in `out` before is whole and unchanged.
     """
     settings = RunSettings(
         learner, str(labels), views, device, default_budget(device) if memory_budget is None else memory_budget, seed,
@@ -287,12 +244,8 @@ def render(
 ) -> list[Path]:
     """Render label maps of a split as `<stem>.png`, of 16 bits if ids take them, and overlays in `overlays/`.
 
-    Those of an earlier `render` into the same folder are replaced, all of them, whatever their split.
-
-    Returns
-    -------
-    list of pathlib.Path
-        The label maps.
+    Returns the label maps. Those of an earlier `render` into the same folder are replaced, all of them, whatever their
+    split.
     """
     scene, dataset = GaussianScene.load(scene_path), Dataset(data)
     result = Segmentation.load(segmentation_path, scene)

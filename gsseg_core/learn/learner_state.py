@@ -103,14 +103,9 @@ class State:
         check_same_names(self.class_names, known, source, where, StateFileError)
 
     def save(self, path: str | os.PathLike[str], digest: str) -> None:
-        """Write the state of the scene with this digest, atomically. Colours of the scene are not in the file.
+        """Write the state of the scene with this digest, atomically (`WriteError`); colours are not in the file.
 
-        Raises
-        ------
-        PathTakenError
-            Something is there that is no saved state; it is unchanged.
-        WriteError
-            The file cannot be written; an earlier one is unchanged.
+        Raises `PathTakenError` where something is there that is no saved state; it is unchanged.
         """
         path = Path(path)
         check_replaceable(path, "saved state", npz_format(path) in _FORMATS)
@@ -159,14 +154,8 @@ class State:
         With `first`, what was saved for that scene or holds the geometry of its own is read as well; `living` is then
         the scene that it was saved for.
 
-        Raises
-        ------
-        StateFileError
-            The file is missing or damaged, or holds what no state holds.
-        StateMismatchError
-            It belongs to another scene.
-        PathNotAllowedError
-            The file lies outside `within`.
+        Raises `StateFileError` where the file is missing or damaged, or holds what no state holds,
+        `StateMismatchError` where it belongs to another scene, `PathNotAllowedError` where it lies outside `within`.
         """
         path = Path(path)
         with open_npz(path, "a saved state", _FORMATS, None if first else digest, within) as (file, header):

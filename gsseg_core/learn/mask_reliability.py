@@ -119,13 +119,7 @@ def sum_cells(cells: Sequence[Cells]) -> Cells:
 
 
 class MaskChecker:
-    """Compares the masks of a fitted learner with what it predicts of them without learning from them.
-
-    Parameters
-    ----------
-    learner : Learner
-        After `fit`. It must not learn on while this is in use.
-    """
+    """Compares masks of a learner, after `fit`, with what it predicts without learning from them; it must not go on."""
 
     def __init__(self, learner: Learner) -> None:
         self.learner = learner
@@ -221,12 +215,9 @@ def shown_views(checks: Iterable[ViewCheck]) -> list[ViewCheck]:
 def reliability_report(checks: Iterable[ViewCheck], class_names: Mapping[int, str]) -> list[dict[str, Any]]:
     """Reliability of each view for `report.json`, the worst first.
 
-    Returns
-    -------
-    list of dict
-        `name`; `reliability` in [0, 1], None where there is no prediction; `num_pixels` with a label; `rejected_share`,
-        the share of them whose label was rejected; `confusions`, largest first: `true`, the class that the others
-        predict, `seen` as, and the `share` of the view's checked pixels.
+    Of each its `name`; `reliability` in [0, 1], None where there is no prediction; `num_pixels` with a label;
+    `rejected_share`, the share of them whose label was rejected; and `confusions`, the largest first: `true`, the class
+    that the others predict, `seen` as, and the `share` of the view's checked pixels.
     """
 
     def name(label: int) -> str:

@@ -35,23 +35,13 @@ def merge_states(
     Views of the same name are told apart: the later one is called like "view_2". Codes that were learnt are those of
     the views of one state, and go.
 
-    Parameters
-    ----------
-    saved : sequence of Saved
-        In the order in which they are added.
-    without : callable, optional
-        Takes views, by name, and their votes out of a state, and with True all those that it no longer keeps. With it,
-        a view that several states keep counts once; otherwise as often as they keep it, as without the scene nobody
-        knows its votes. Views that a state no longer keeps count once if those before it know all of them, or none.
+    `without` takes views, by name, and their votes out of a state, and with True all those that it no longer keeps.
+    With it, a view that several states keep counts once; otherwise as often as they keep it, as without the scene
+    nobody knows its votes. Views that a state no longer keeps count once if those before it know all of them, or none.
 
-    Raises
-    ------
-    StateMismatchError
-        They are of different scenes.
-    StateFileError
-        They have different names for one class, or ids that each session gave to the objects that it found; or one
-        brings no view that one before it has not, and would count twice; or some have votes of whole rays, and some
-        have not.
+    Raises `StateMismatchError` where they are of different scenes, and `StateFileError` where they have different names
+    for one class, or ids that each session gave to the objects that it found; where one brings no view that one before
+    it has not, and would count twice; or where some have votes of whole rays, and some have not.
     """
     first = saved[0]
     names: dict[int, str] = {}

@@ -30,12 +30,7 @@ def default_budget(device: str = "cpu") -> int:
 class PreparedViews:
     """Prepared views by name; a copy sent elsewhere has those in memory alone.
 
-    Parameters
-    ----------
-    budget : int
-        Bytes of memory that they may take; 0 keeps nothing.
-    with_file : bool
-        Whether what is beyond the budget may go to a temporary file.
+    They take `budget` bytes of memory at most, and 0 keeps nothing; more may go to a temporary file, if `with_file`.
     """
 
     def __init__(self, budget: int, with_file: bool) -> None:

@@ -60,21 +60,10 @@ def make_learner(
     name: str, scene: GaussianScene, num_classes: int, *,
     max_steps: int | None = None, seed: int = 0, client: Client | None = None, **where: Any,
 ) -> Learner:  # fmt: skip
-    """Make one of `LEARNERS` by its name, with its default settings.
+    """Make one of `LEARNERS` by its name, with its default settings; `SettingsError` if there is no such learner.
 
-    Parameters
-    ----------
-    scene, num_classes, where
-        As `gsseg_core.learn.learner.Learner` takes them; `where` is `device` and `memory_budget`.
-    max_steps, seed
-        As `Learner.default_settings` takes them.
-    client : distributed.Client, optional
-        Have the workers of this Dask cluster do it, if the learner can be distributed.
-
-    Raises
-    ------
-    SettingsError
-        There is no such learner.
+    `max_steps` and `seed` are as `Learner.default_settings` takes them, `where` is `device` and `memory_budget` as
+    `Learner` does. With a `client`, the workers of its Dask cluster learn, if the learner can be distributed.
     """
     check_learner(name)
     distributed = LEARNERS[name].distributed if client is not None else ""

@@ -130,10 +130,7 @@ def sample_grid(image: np.ndarray, labels: np.ndarray) -> Sample:
 def fit_temperature(samples: Sequence[Sample]) -> float:
     """Fit the temperature at which held-out masks are likeliest, each seen through a confusion matrix of its own.
 
-    Returns
-    -------
-    float
-        In [`LOWEST`, `HIGHEST`]; 1 where there is no pixel to go by.
+    It is in [`LOWEST`, `HIGHEST`], and 1 where there is no pixel to go by.
     """
     known = [_Cells.of(sample) for sample in samples if len(sample.seen)]
     if not known:

@@ -24,17 +24,7 @@ from gsseg_core.spatial.row_order import along_curve
 
 
 class LivingVotes(VoteLearner):
-    """Learner by votes over a `LivingScene`; a view is lifted in the frame of its group.
-
-    Parameters
-    ----------
-    living : LivingScene
-        N Gaussians.
-    num_classes : int
-        K.
-    device : str
-        Where views are rendered.
-    """
+    """Learner by votes over a `LivingScene`; a view is lifted in the frame of its group."""
 
     def __init__(self, living: LivingScene, num_classes: int, *, device: str = "cpu") -> None:
         # Views are rendered again where they are needed; to keep them prepared would take far more memory than masks.
@@ -61,19 +51,8 @@ class LivingVotes(VoteLearner):
     def change(self, change: SceneChange, joining: Mapping[str, int | None], *, all_kept: bool = False) -> list[str]:
         """Go over to the scene after a change, with the votes that views have in that: their masks are `View.held`.
 
-        Parameters
-        ----------
-        change : SceneChange
-            From the scene of now to another one.
-        joining : mapping from view to group
-            Views that belong to another group from now on; others keep theirs.
-        all_kept : bool
-            Whether the votes are those of the views that are kept, and of no others.
-
-        Returns
-        -------
-        list of str
-            Views that were lifted anew.
+        `joining` has the group of each view that belongs to another one from now on; `all_kept` says whether the votes
+        are those of the views that are kept, and of no others. Returns the views that were lifted anew.
         """
         views = {name: self._joined(view, joining.get(name, view.group)) for name, view in self.views.items()}
         lifted = [

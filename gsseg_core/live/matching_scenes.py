@@ -22,19 +22,8 @@ class Matching(NamedTuple):
 def match_scenes(before: LivingScene, scene: GaussianScene, tolerance: float = 0.0) -> Matching:
     """Find each Gaussian of a scene in the one before: by id where both have ids, else by position.
 
-    Parameters
-    ----------
-    before : LivingScene
-        N Gaussians.
-    scene : GaussianScene
-        N' Gaussians.
-    tolerance : float
-        Farthest that a Gaussian may have moved to be found by its position, in scene units.
-
-    Raises
-    ------
-    SettingsError
-        The tolerance is NaN, infinite or negative.
+    Those found by position have moved no farther than the tolerance, in scene units; `SettingsError` for one that is
+    NaN, infinite or negative.
     """
     if not 0 <= tolerance < np.inf:
         raise SettingsError(f"tolerance is {tolerance:g}; expected a distance in scene units, 0 or more")
@@ -50,25 +39,16 @@ def match_scenes(before: LivingScene, scene: GaussianScene, tolerance: float = 0
     return Matching(after, origin, "position")
 
 
-def places_in_saved(saved: LivingScene, first: LivingScene, now: LivingScene) -> np.ndarray:
+def places_in_saved(
+    saved: LivingScene,  # what a state was saved of
+    first: LivingScene,  # what the session began with, under the numbers of now
+    now: LivingScene,  # N' Gaussians
+) -> np.ndarray:
     """Find the Gaussians of now in a saved scene, where the session has numbered them itself: (N',) int64, or -1.
 
     Numbers mean the same there if most Gaussians that the session began with are what has their numbers there. If not,
-    the file of one of the two was in another order, and Gaussians are those that lie at exactly the same place.
-
-    Parameters
-    ----------
-    saved : LivingScene
-        What a state was saved of.
-    first : LivingScene
-        What the session began with, under the numbers of now.
-    now : LivingScene
-        N' Gaussians.
-
-    Raises
-    ------
-    StateMismatchError
-        Neither finds half of the smaller scene.
+    the file of one of the two was in another order, and Gaussians are those that lie at exactly the same place. Raises
+    `StateMismatchError` where neither finds half of the smaller scene.
     """
     places = saved.places(first.ids)
     found = places >= 0

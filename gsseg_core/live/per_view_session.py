@@ -85,12 +85,8 @@ class PerViewSession(LiveSession):
     def repair(self) -> Repair:
         """Associate the views that are kept anew, and move their votes to the objects that turn out to be right.
 
-        Votes of views that are no longer kept go along with most of their object.
-
-        Raises
-        ------
-        UnknownLabelError
-            There would be more objects than `max_classes`. Nothing has changed, as after any error.
+        Votes of views that are no longer kept go along with most of their object. Raises `UnknownLabelError` where
+        there would be more objects than `max_classes`; nothing has changed then, as after any error.
         """
         with self._lock:
             undo, back = self._table.checkpoint(), None
@@ -137,12 +133,8 @@ class PerViewSession(LiveSession):
     def at_level(self, result: Segmentation, granularity: float | None) -> Segmentation:
         """Cut a result of `segmentation` at a level of the tree of parts and wholes, by the views that are kept now.
 
-        None gives the objects, with their tree. Where the scene has changed since, it stays as it is.
-
-        Raises
-        ------
-        SettingsError
-            The granularity is not in [0, 1].
+        None gives the objects, with their tree. Where the scene has changed since, it stays as it is. Raises
+        `SettingsError` where the granularity is not in [0, 1].
         """
         with self._lock:
             scene = self.scene_of(result)
@@ -157,12 +149,8 @@ class PerViewSession(LiveSession):
     def learn(self, learner: str = "em", dataset: Dataset | None = None, **settings: Any) -> Outcome:
         """Repair, then learn class probabilities from the views kept. The repair stays, even if learning is ended.
 
-        Raises
-        ------
-        SettingsError
-            A dataset is given: its objects would have numbers of their own.
-        NoUsableViewsError
-            There is no view to learn from.
+        Raises `SettingsError` where a dataset is given, whose objects would have numbers of their own, and
+        `NoUsableViewsError` where there is no view to learn from.
         """
         if dataset is not None:
             raise SettingsError(f"{dataset.root}: ids are per view; expected to learn from the views received only")

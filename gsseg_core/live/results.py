@@ -53,27 +53,13 @@ class Rejection:
 
 @dataclass(frozen=True, eq=False)
 class Outcome:
-    """Outcome of `LiveSession.learn`.
+    """Outcome of `LiveSession.learn`."""
 
-    Attributes
-    ----------
-    learnt : Learnt
-        The class probabilities, in force from now on.
-    num_steps : int
-        Steps that were done; 0 for a learner that has none.
-    converged : bool
-        Whether it stopped because another step would have changed little.
-    loss : float
-        What the learner minimises, per labelled pixel, in nats, at the end; NaN where it has no such thing.
-    rejected : dict of str to str
-        Names of views that could not be used, and why.
-    """
-
-    learnt: Learnt
-    num_steps: int
-    converged: bool
-    loss: float
-    rejected: dict[str, str]
+    learnt: Learnt  # the class probabilities, in force from now on
+    num_steps: int  # that were done; 0 for a learner that has none
+    converged: bool  # whether it stopped because another step would have changed little
+    loss: float  # what the learner minimises, per labelled pixel, in nats, at the end; NaN where there is no such thing
+    rejected: dict[str, str]  # names of views that could not be used, and why
 
 
 def observe_and_fit(

@@ -24,14 +24,9 @@ Rows = TypeVar("Rows", np.ndarray, CSRRows)
 
 
 class SceneChange:
-    """What differs between a scene before and after a change, seen from the frame of each group.
+    """What differs between a scene of N Gaussians and of N' after a change, seen from the frame of each group.
 
-    Parameters
-    ----------
-    before, after : LivingScene
-        N and N' Gaussians.
-    origin : (N',) int64
-        Where each Gaussian was before; -1 for those that were not there.
+    `origin` says where each was before, (N',) int64; -1 for those that were not there.
     """
 
     def __init__(self, before: LivingScene, after: LivingScene, origin: np.ndarray) -> None:

@@ -101,35 +101,17 @@ class SessionClasses:
 
 
 def ids_by_name(
-    names: Mapping[int, str], known: Mapping[int, str], max_classes: int, count: int = 0, *, keep_numbers: bool = True
+    names: Mapping[int, str],  # the segmenter's classes by its numbers
+    known: Mapping[int, str],  # classes so far; of several of one name the first counts, those like "class_07" are none
+    max_classes: int,  # 0: there are no new classes, and what is not known is background
+    count: int = 0,  # classes that there are by number, known by a name or not: masks without names may have these
+    *,
+    keep_numbers: bool = True,  # whether the segmenter's numbers are wanted as ids
 ) -> dict[int, int]:
-    """Find the ids of a segmenter's classes by their names.
+    """Find the ids of a segmenter's classes, by its numbers; `UnknownLabelError` for more classes than labels.
 
-    A class that is known has its id. A new one gets the segmenter's number, if that is free and below `max_classes`,
-    and else the next one after all. 0 is the background's.
-
-    Parameters
-    ----------
-    names : mapping from number to name
-        The segmenter's classes.
-    known : mapping from id to name
-        The classes so far; of several of one name the first counts, and names like "class_07" are none.
-    max_classes : int
-        0: there are no new classes, and what is not known is background.
-    count : int
-        Classes that there are by number, known by a name or not: masks without names may have voted for those.
-    keep_numbers : bool
-        Whether the segmenter's numbers are wanted as ids.
-
-    Returns
-    -------
-    dict of int to int
-        Id by number.
-
-    Raises
-    ------
-    UnknownLabelError
-        There would be more classes than labels.
+    A class that is known by its name has its id. A new one gets the segmenter's number, if that is free and below
+    `max_classes`, and else the next one after all. 0 is the background's.
     """
     known = {k: name for k, name in known.items() if name != class_name({}, k)}
     ids = {BACKGROUND_NAME: 0} | {name: k for k, name in sorted(known.items(), reverse=True)}

@@ -45,28 +45,13 @@ class MergeTree(NamedTuple):
 def click_labels(
     scene: GaussianScene, camera: Camera, inside: Sequence[Pixel], outside: Sequence[Pixel] = (), *, device: str = "cpu"
 ) -> np.ndarray:
-    """Make labels for `gsseg_core.objects.pick.pick_mask` of clicks in a view.
+    """Make labels for `gsseg_core.objects.pick.pick_mask` of clicks in a view, (H, W) int32.
 
-    Parameters
-    ----------
-    scene, camera
-        What the clicks were made on, and where.
-    inside : sequence of (row, column)
-        Pixels of the object, at least one. Each adds the region around it.
-    outside : sequence of (row, column)
-        Pixels that are not of it: no region holds one of these.
+    They are 1 for the object, 0 for what is not it, and -1 in the cells around it. Each pixel `inside`, at least one,
+    adds the region around it; no region holds one that is `outside`.
 
-    Returns
-    -------
-    (H, W) int32
-        1 object, 0 not, -1 in the cells around it.
-
-    Raises
-    ------
-    SettingsError
-        There is no such pixel, no click inside, or a pixel is clicked as both.
-    NoUsableViewsError
-        A click inside shows no Gaussian.
+    Raises `SettingsError` where there is no such pixel, no click inside, or a pixel is clicked as both, and
+    `NoUsableViewsError` where a click inside shows no Gaussian.
     """
     for row, column in (*inside, *outside):
         camera.checked_pixel(row, column)

@@ -85,13 +85,7 @@ def explain_segments(
     """Find for each segment the object of the largest IoU, 0 where there is none, and its weight on known Gaussians.
 
     The objects are those that `add_objects` made of the same segments; each view is left out of what is said of its own
-    segments.
-
-    Returns
-    -------
-    best : (n,) int64
-    known : (n,) float64
-        Weight of the segment on Gaussians of which other views say anything, in px.
+    segments. Both are (n,), int64 and float64, in px; known are Gaussians of which other views say anything.
     """
     best, known = np.zeros(len(objects), np.int64), np.zeros(len(objects))
     for v in nb.prange(len(views.starts) - 1):

@@ -51,26 +51,13 @@ class ObjectTable:
     Views come one at a time: `match` gives the ids of a new one the numbers of the objects that are known so far, at
     once. `solve` looks at all views together and repairs what one view could not know: it merges objects that were one,
     and parts others. What it finds does not depend on the order in which the views came.
-
-    Parameters
-    ----------
-    scene : GaussianScene
-        N Gaussians.
-    settings : AssociationSettings, optional
-    device : str
-        Where views are rendered.
-
-    Attributes
-    ----------
-    views : dict of str to View
-        The views as they came, by name.
     """
 
     def __init__(
         self, scene: GaussianScene, settings: AssociationSettings | None = None, *, device: str = "cpu"
     ) -> None:
         self.scene, self.settings, self.device = scene, settings or AssociationSettings(), device
-        self.views: dict[str, View] = {}
+        self.views: dict[str, View] = {}  # as they came, by name
         self._lifted: dict[str, Lifted] = {}
         self._objects: dict[str, np.ndarray] = {}
         self._largest, self._agreement = 0, self.settings.agreement

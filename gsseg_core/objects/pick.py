@@ -99,24 +99,13 @@ def pick_mask(scene: GaussianScene, view: View, settings: GraphSettings = GRAPH,
 def pick_masks(
     scene: GaussianScene, views: Sequence[View], settings: GraphSettings = GRAPH, *, device: str = "cpu"
 ) -> Pick:
-    """Pick the object that masks of some views show.
+    """Pick the object that masks of some views show; `settings` say how what was seen spreads to what was not.
 
-    Parameters
-    ----------
-    scene : GaussianScene
-        N Gaussians.
-    views : sequence of View
-        Labels are 1 for the object, 0 for what is not it, -1 where nothing is said; so scribbles will do, of both
-        kinds. Make one by `View.from_arrays(camera, labels)`. A view that shows nothing of the object has 0 alone.
-    settings : GraphSettings
-        How what was seen spreads to what was not.
+    Labels of views are 1 for the object, 0 for what is not it, -1 where nothing is said; so scribbles will do, of both
+    kinds. Make one by `View.from_arrays(camera, labels)`. A view that shows nothing of the object has 0 alone.
 
-    Raises
-    ------
-    NoUsableViewsError
-        No Gaussian is seen in a pixel of the object, or none in one that is not it: then nothing says where it ends.
-    SettingsError
-        There are other labels, or no views.
+    Raises `NoUsableViewsError` where no Gaussian is seen in a pixel of the object, or none in one that is not it, so
+    that nothing says where it ends; `SettingsError` where there are other labels, or no views.
     """
     if not views:
         raise SettingsError("found no masks to pick an object by; expected at least one view")
@@ -154,36 +143,18 @@ def pick_clicks(
 
 def read_object_mask(
     path: str | os.PathLike[str],
-    camera: Camera,
-    label: str | int | None = None,
-    class_names: Mapping[int, str] | None = None,
+    camera: Camera,  # whose image the mask is drawn on as it was taken, of its size or the same larger or smaller
+    label: str | int | None = None,  # the object's: an id, or the name of a class; by default all but 0
+    class_names: Mapping[int, str] | None = None,  # of what label images hold; masks of other programs bring their own
 ) -> np.ndarray:
-    """Read a drawn mask of a view, or one label of it, as labels for `pick_mask`.
+    """Read a drawn mask of a view, or one label of it, as labels (H, W) int32 of the pinhole view for `pick_mask`.
 
-    Parameters
-    ----------
-    path : path
-        A label image, a PNG of ids; in one of black and white only, soft edges or not, 255 is the object and not
-        unknown, and so is what is nearer to it. Or masks of another program, see docs/formats.md; a file with the mask
-        of one image may have any name.
-    camera : Camera
-        Of the view. The mask is drawn on the image as it was taken, of its size or the same larger or smaller.
-    label : int or str, optional
-        The object's: an id, or the name of a class; by default all but 0.
-    class_names : mapping from id to name, optional
-        Names of what label images hold; masks of other programs bring their own.
+    It is a label image, a PNG of ids; in one of black and white only, soft edges or not, 255 is the object and not
+    unknown, and so is what is nearer to it. Or it is of another program, see docs/formats.md; a file with the mask of
+    one image may have any name.
 
-    Returns
-    -------
-    (H, W) int32
-        1 object, 0 not, -1 unknown, as the pinhole view sees them.
-
-    Raises
-    ------
-    MaskFormatError, MaskSizeError
-        The file holds no masks, has none of this view or of another shape, or nothing in it is the object.
-    SettingsError
-        There is no such class.
+    Raises `MaskFormatError` or `MaskSizeError` where the file holds no masks, has none of this view or of another
+    shape, or nothing in it is the object; `SettingsError` where there is no such class.
     """
     path, names = Path(path), class_names
     masks = None if path.suffix.lower() == ".png" else open_masks(path, [camera.image])

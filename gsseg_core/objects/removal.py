@@ -18,21 +18,10 @@ def without_objects(scene: GaussianScene, segmentation: Segmentation, classes: C
 
     It is the exact complement of `export_classes`: the objects' PLYs and what is left make up the scene. What the
     objects hid was never seen, so there may be holes; nothing is made up to fill them. Gaussians that refinement took
-    out of an object (`REMOVED`) stay in the scene.
+    out of an object (`REMOVED`) stay in the scene. The classes are ids, at least one, also of parts and wholes.
 
-    Parameters
-    ----------
-    classes : collection of int
-        Ids, at least one; those of parts and wholes, too.
-
-    Raises
-    ------
-    SettingsError
-        A class has no Gaussians.
-    EmptySceneError
-        Nothing would be left.
-    StateMismatchError
-        The segmentation belongs to another scene.
+    Raises `SettingsError` where a class has no Gaussians, `EmptySceneError` where nothing would be left,
+    `StateMismatchError` where the segmentation belongs to another scene.
     """
     return scene.subset(left_without(scene, segmentation, classes))
 

@@ -69,12 +69,8 @@ class Stack:
     def overlaps(self) -> tuple[sparse.csr_matrix, np.ndarray, np.ndarray]:
         """Overlaps of the A segments that are no background, by the formulas at the top of `association`.
 
-        Returns
-        -------
-        overlap : (A, n + W) float32
-            O, and its sums by whole; zero with background, and where it is next to nothing of what the view sees.
-        seen, hidden : (A, views) float32
-            V; and how much of that the view calls background.
+        These are O, and its sums by whole, (A, n + W) float32, zero with background, and where it is next to nothing of
+        what the view sees; V; and how much of that the view calls background, (A, views) float32 each.
         """
         roots = [np.sqrt(sums(view.weights, 0)).astype(np.float32) for view in self.views]
         scaled = [view.weights.data / root[view.weights.indices] for view, root in zip(self.views, roots, strict=True)]

@@ -19,21 +19,11 @@ from gsseg_core.scene.gaussian_scene import GaussianScene
 class DepthTolerance:
     """How far a measured depth may be from the scene's: `absolute + relative * depth`.
 
-    Attributes
-    ----------
-    absolute : float
-        In the units of the measured depth, such as metres.
-    relative : float
-        Share of the scene's depth.
-
-    Raises
-    ------
-    SettingsError
-        One of them is negative, NaN or infinite.
+    Raises `SettingsError` where one of them is negative, NaN or infinite.
     """
 
-    absolute: float = 0.1
-    relative: float = 0.05
+    absolute: float = 0.1  # in the units of the measured depth, such as metres
+    relative: float = 0.05  # share of the scene's depth
 
     def __post_init__(self) -> None:
         """Validate."""
@@ -53,41 +43,21 @@ class Gated(NamedTuple):
 
 def gate_view(
     scene: GaussianScene,
-    view: View,
-    depth: np.ndarray,  # (H, W)
-    tolerance: DepthTolerance | None = None,
+    view: View,  # with a mask
+    depth: np.ndarray,  # (H, W) along the optical axis, in the view's own pixels
+    tolerance: DepthTolerance | None = None,  # how far the two may be apart, in the units of `depth`
     *,
-    scale: float = 1.0,
+    scale: float = 1.0,  # units of `depth`, such as metres, per unit of the scene
     device: str = "cpu",
 ) -> Gated:
     """Make those pixels of a view's mask unknown in which a depth camera measured something else than the scene.
 
     What is nearer than the scene by more than the tolerance, as a person, hides it. What is farther shows that
     something of the scene is gone; that counts only where the scene covers more than half of the ray, for through less
-    one sees what lies behind.
+    one sees what lies behind. A depth that is zero, negative, NaN or infinite was not measured, and says nothing.
 
-    Parameters
-    ----------
-    scene : GaussianScene
-        What the view is of.
-    view : View
-        With a mask.
-    depth : (H, W) float
-        Measured along the optical axis, in the view's own pixels; zero, negative, NaN or infinite where nothing was
-        measured, which says nothing.
-    tolerance : DepthTolerance, optional
-        How far the two may be apart, in the units of `depth`.
-    scale : float
-        Units of `depth` per unit of the scene, such as metres.
-    device : str
-        Where the depth of the scene is rendered.
-
-    Raises
-    ------
-    MaskSizeError
-        The depth is not of the size of the view.
-    GssegError
-        The mask cannot be read, or the scale is not above 0, or infinite.
+    Raises `MaskSizeError` where the depth is not of the size of the view, `SettingsError` where the scale is not above
+    0, or infinite, and what reading the mask raises.
     """
     camera, tolerance = view.camera, tolerance or DepthTolerance()
     camera.check_image(depth, "depth has")

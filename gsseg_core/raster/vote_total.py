@@ -38,16 +38,10 @@ class VoteTotal:
     """Votes of N Gaussians for K classes, in whole `VOTE_UNIT`s, int64: what is added can be taken back exactly.
 
     Pages hold the Gaussians in an `order`, by default their own. Nothing but memory and time depends on it.
-
-    Attributes
-    ----------
-    shape : (int, int)
-        N and K.
-    order : RowOrder
     """
 
     def __init__(self, num_gaussians: int, num_classes: int, order: RowOrder | None = None) -> None:
-        self.shape = num_gaussians, num_classes
+        self.shape = num_gaussians, num_classes  # N and K
         self.order = order or RowOrder.own(num_gaussians)
         # Page of a class and a block; with rows to spare for classes that are still to come.
         self._table = np.full((num_classes, -(-num_gaussians // PAGE)), _NONE, np.int32)

@@ -92,11 +92,9 @@ class Lens:
     models of OpenCV and COLMAP, after Brown (1966), Weng et al. (1992) and Kannala & Brandt (2006). A panorama has the
     forward direction in its middle and covers 360 degrees across and 180 down.
 
-    Raises
-    ------
-    IntrinsicsError
-        A number is NaN, infinite or impossible, or the distortion cannot be undone: not every pixel of the largest
-        circle around the middle of the image has its own ray. In the corners beyond it, that may be.
+    Raises `IntrinsicsError` where a number is NaN, infinite or impossible, or the distortion cannot be undone: not
+    every pixel of the largest circle around the middle of the image has its own ray. In the corners beyond it, that may
+    be.
     """
 
     model: LensModel  # one of `LENS_MODELS`

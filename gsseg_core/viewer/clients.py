@@ -55,18 +55,13 @@ class ClientRenderers:
 
     `drawn_by` is one of `DRAWN_BY`: in `AUTO`, a browser gets images until it has shown that it draws fast. `device` is
     where images are drawn.
-
-    Attributes
-    ----------
-    by_client : dict of int to ClientRenderer
-        The browsers of now, by viser's id.
     """
 
     def __init__(self, server: viser.ViserServer, scene: GaussianScene, drawn_by: str, device: str) -> None:
         self._server, self._splats, self._drawn_by, self._device = server, Splats(scene), drawn_by, device
         self._lock = threading.Lock()
         self._picture: Picture | None = None
-        self.by_client: dict[int, ClientRenderer] = {}
+        self.by_client: dict[int, ClientRenderer] = {}  # the browsers of now, by viser's id
         server.on_client_connect(self._join)
         server.on_client_disconnect(self._leave)
 

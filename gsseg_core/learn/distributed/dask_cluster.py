@@ -25,12 +25,8 @@ UNREACHABLE = (OSError, TimeoutError, asyncio.TimeoutError)  # what Dask raises 
 def connected(address: str) -> Iterator[Client]:
     """Connect to a Dask scheduler.
 
-    Raises
-    ------
-    SettingsError
-        Dask is not installed, or this is no address.
-    SchedulerError
-        No scheduler answers, it has no workers, or gsseg is missing there or is another version.
+    Raises `SettingsError` where Dask is not installed, or this is no address; `SchedulerError` where no scheduler
+    answers, it has no workers, or gsseg is missing there or is another version.
     """
     if not re.fullmatch(r"(tcp://)?([^\s:/\[\]]+|\[[^\s/\[\]]+\]):\d{1,5}", address):
         raise SettingsError(f"scheduler is {address!r}; expected an address such as tcp://host:8786")
@@ -102,13 +98,7 @@ def _no_scheduler(address: str, found: str) -> SchedulerError:
 
 
 def find_workers(client: Client) -> dict[str, int]:
-    """List the threads of each worker by its address; when there is none, wait for one.
-
-    Raises
-    ------
-    SchedulerError
-        None comes, or the scheduler is lost.
-    """
+    """List the threads of each worker by its address; `SchedulerError` if none comes, or the scheduler is lost."""
     deadline = time.monotonic() + PATIENCE
     while True:
         late = time.monotonic() > deadline  # However long this process stood still, it looks once more.

@@ -81,14 +81,9 @@ class _OnWorkers(Learner):
         self, task: Callable[..., OverViews], views: Mapping[str, View], report: Done,
         by_view: Mapping[str, Any] | None = None, *values: Any,
     ) -> OverViews:  # fmt: skip
-        """Sum up what a task makes of these views.
+        """Sum up what a task makes of these views; raises what is wrong with one.
 
-        Raises
-        ------
-        SchedulerError
-            The scheduler is lost, or all workers, or results again and again.
-        GssegError
-            What was wrong with a view.
+        Raises `SchedulerError` where the scheduler is lost, or all workers, or results again and again.
         """
         for _ in range(ATTEMPTS):
             used: list[Future] = []

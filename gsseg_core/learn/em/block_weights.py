@@ -19,22 +19,14 @@ STEP = 2  # in rows and columns, from one block to the next of those farther awa
 FAR = 4.0  # weight of these, each for the four that it stands for
 
 
-def block_weights(labels: np.ndarray, mask: np.ndarray) -> np.ndarray:
-    """Weigh the blocks of a view's mask; those of weight 0 are left out.
+def block_weights(
+    labels: np.ndarray,  # (H, W) int32: the mask as it is learnt from, its boundaries aligned
+    mask: np.ndarray,  # (H, W) int32: the mask as it came
+) -> np.ndarray:
+    """Weigh the blocks of a view's mask, (ceil(H / 4), ceil(W / 4)) float32; those of weight 0 are left out.
 
     Which of those far from boundaries are gone through follows from where the mask had its boundaries, not from names
     of views or classes: the same masks teach the same, whoever sends them.
-
-    Parameters
-    ----------
-    labels : (H, W) int32
-        The mask as it is learnt from, its boundaries aligned.
-    mask : (H, W) int32
-        The mask as it came.
-
-    Returns
-    -------
-    (ceil(H / 4), ceil(W / 4)) float32
     """
     near = near_boundaries(labels, NEAR)
     first, some = crc32(near_boundaries(mask, 0).tobytes()) % STEP**2, np.zeros(near.shape, np.float32)

@@ -60,23 +60,12 @@ def reach(farthest: int) -> int:
     return 2 * farthest + FARTHEST
 
 
-def align_boundaries(labels: np.ndarray, edges: np.ndarray, farthest: int) -> np.ndarray:
-    """Align a mask and its boundaries with edges of the scene.
-
-    Parameters
-    ----------
-    labels : (H, W) int32
-        The mask; negative where unknown.
-    edges : (H, W) float32
-        Their strength, from `scene_edges`, as far as `reach` from boundaries and in the sample.
-    farthest : int
-        S, in px: regions are drawn too wide or too narrow by this much at most.
-
-    Returns
-    -------
-    (H, W) int32
-        A new mask; unknown, too, along the sides that it was moved away from.
-    """
+def align_boundaries(
+    labels: np.ndarray,  # (H, W) int32: the mask; negative where unknown
+    edges: np.ndarray,  # (H, W) float32: by `scene_edges`, as far as `reach` from boundaries and in the sample
+    farthest: int,  # S, in px: regions are drawn too wide or too narrow by this much at most
+) -> np.ndarray:
+    """Align a mask and its boundaries with edges of the scene; where it was moved away from a side, it is unknown."""
     here = _align_regions(labels, edges, farthest)
     offset = likeliest_offset(here.beside, here.weights, edges)
     if offset == (0, 0):
@@ -190,12 +179,7 @@ def _mean_field_round(
 def _nearest_regions(region: np.ndarray, farthest: int) -> tuple[np.ndarray, np.ndarray]:  # (H, W) int32
     """Find for each pixel the nearest other region, by spreading from boundary pixels, band by band.
 
-    Returns
-    -------
-    other : (H, W) int32
-        The region nearest to each pixel, but its own; -1 if that is farther.
-    ring : (H, W) int32
-        How far it is in px, rounded up; 0 if it is farther.
+    Returns the region, (H, W) int32, -1 if it is farther; and how far it is in px, rounded up, (H, W) int32, 0 if so.
     """
     height, width = region.shape
     borders = _borders(region)
@@ -266,14 +250,9 @@ def _boundary_strengths(
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
     """Enumerate pairs of regions that touch, of `count` in all, and sum up edges by pair and ring; images are (H, W).
 
-    Returns
-    -------
-    pairs : (P, 2) int64
-        The lower number first.
-    pair : (H W,) int32
-        Which pair each pixel is near, -1 for none.
-    lengths, strengths : (P, 2 farthest) float64
-        Pixels, and sum of their edges, from the farthest ring inside the second region to that inside the first.
+    Returns the pairs, the lower number first, (P, 2) int64; which of them each pixel is near, -1 for none, (H W,)
+    int32; and pixels and sum of their edges, from the farthest ring inside the second region to that inside the first,
+    (P, 2 farthest) float64 each.
     """
     of_pixel, of_other, rings, strength = region.ravel(), other.ravel(), ring.ravel(), edges.ravel()
     begin, order = _sort_by_lower_region(of_pixel, of_other, count)

@@ -18,18 +18,12 @@ FARTHEST = 8  # rows or columns
 LOG_OFFSETS = 2 * np.log(2 * FARTHEST + 1)  # nats: log of how many offsets there are, all as likely
 
 
-def likeliest_offset(pixels: np.ndarray, weights: np.ndarray, edges: np.ndarray) -> tuple[int, int]:
-    """Find by how many rows and columns to move a mask so that its boundaries meet the strongest edges.
-
-    Parameters
-    ----------
-    pixels : (P,) int64
-        Pixels along the boundaries, counted row by row.
-    weights : (P,) float64
-        What edges of one unit are worth in each of them, in nats.
-    edges : (H, W) float32
-        Strength of the scene's edges.
-    """
+def likeliest_offset(
+    pixels: np.ndarray,  # (P,) int64: along the boundaries, counted row by row
+    weights: np.ndarray,  # (P,) float64: what edges of one unit are worth in each of them, in nats
+    edges: np.ndarray,  # (H, W) float32: strength of the scene's edges
+) -> tuple[int, int]:
+    """Find by how many rows and columns to move a mask so that its boundaries meet the strongest edges."""
     width = edges.shape[1]
     strengths = _strengths(pixels // width, pixels % width, weights, edges)
     middle = strengths.size // 2

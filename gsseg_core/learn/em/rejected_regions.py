@@ -80,16 +80,8 @@ def find_rejected(
 def connected_pixels(labels: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:  # (H, W) int32
     """Label the 4-connected components of pixels of one label, in the order of their first pixels.
 
-    Runs of equal pixels are joined to those of the row above.
-
-    Returns
-    -------
-    connected : (H, W) int32
-        `UNKNOWN` (-1) where the label is negative.
-    first : (R,) int64
-        First pixel of each component, counted row by row.
-    area : (R,) int64
-        Pixels of each component.
+    Returns the components, (H, W) int32, `UNKNOWN` (-1) where the label is negative; and of each its first pixel,
+    counted row by row, and how many it has, (R,) int64 each. Runs of equal pixels are joined to those of the row above.
     """
     (height, width), connected = labels.shape, np.empty(labels.shape, np.int32)
     # Of runs; there are at most as many as pixels.

@@ -17,20 +17,13 @@ from gsseg_core.spatial.neighbourhood import neighbour_weights, neighbours_of
 
 
 def spatial_prior(
-    shares: CSRRows, evidence: np.ndarray, scene: GaussianScene, k: int, weight: float, num_classes: int
-) -> CSRRows:
-    """Mean probabilities of the k nearest Gaussians, the better seen the more, times a weight; empty rows if none was.
-
-    Parameters
-    ----------
-    shares : CSRRows
-        Of each class, N rows, in any unit: votes of at least 0, or probabilities.
-    evidence : (N,) float
-        By how many px each was seen, 0 where it was not.
-    """
+    shares: CSRRows, evidence: np.ndarray,  # N rows of votes from 0, or probabilities; (N,) px by which each was seen
+    scene: GaussianScene, k: int, weight: float, num_classes: int,
+) -> CSRRows:  # fmt: skip
+    """Mean probabilities of the k nearest Gaussians, by how well each was seen, times `weight`; empty if none was."""
     neighbours = neighbours_of(scene, k) if weight else None
     if neighbours is None:
-        return CSRRows(np.zeros_like(shares.indptr), np.empty(0, np.uint32), np.empty(0, np.float32))
+        return CSRRows.empty(shares.num_rows, np.float32)
     codes = shares.with_data(shares.data.astype(np.float32)).normalised()
     mean = neighbours.mean_codes(codes, neighbour_weights(evidence > 0, evidence), num_classes).normalised()
     return mean.with_data(np.float32(weight) * mean.data)
