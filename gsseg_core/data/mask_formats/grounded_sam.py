@@ -6,8 +6,7 @@ The smaller mask is on top, so that what stands on a table shows.
 from __future__ import annotations
 
 from gsseg_core.data.mask_formats.coco import segmentation
-from gsseg_core.data.mask_formats.masks import MaskSet
-from gsseg_core.data.mask_formats.named import NamedDrawing, NamedShape, read_named
+from gsseg_core.data.mask_formats.named import NamedDrawing, NamedShape
 from gsseg_core.data.mask_formats.place import Place
 from gsseg_core.data.mask_formats.record import Record
 from gsseg_core.data.mask_formats.shapes import Runs
@@ -19,12 +18,8 @@ def is_grounded_sam(place: Place) -> bool:
     return isinstance(content, dict) and isinstance(content.get("annotations"), list) and "img_width" in content
 
 
-def read_grounded_sam(place: Place) -> MaskSet:
-    """Read Grounded SAM 2."""
-    return read_named(place, _parse)
-
-
-def _parse(whole: Record) -> NamedDrawing:
+def parse_grounded_sam(whole: Record) -> NamedDrawing:
+    """Read the shapes of an image, as `read_named` has it."""
     size = whole.size("img_width", "img_height")
     return NamedDrawing(size, (_shape(found, *size) for found in whole.records("annotations", "annotation")))
 

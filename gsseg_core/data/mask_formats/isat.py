@@ -5,8 +5,7 @@ Objects of a higher layer are on top, and of those of one layer the last.
 
 from __future__ import annotations
 
-from gsseg_core.data.mask_formats.masks import MaskSet
-from gsseg_core.data.mask_formats.named import NamedDrawing, NamedShape, read_named
+from gsseg_core.data.mask_formats.named import NamedDrawing, NamedShape
 from gsseg_core.data.mask_formats.place import Place
 from gsseg_core.data.mask_formats.record import Record
 from gsseg_core.data.mask_formats.shapes import Polygons
@@ -19,12 +18,8 @@ def is_isat(place: Place) -> bool:
     return isinstance(info, dict) and isinstance(objects, list)
 
 
-def read_isat(place: Place) -> MaskSet:
-    """Read ISAT."""
-    return read_named(place, _parse)
-
-
-def _parse(whole: Record) -> NamedDrawing:
+def parse_isat(whole: Record) -> NamedDrawing:
+    """Read the shapes of an image, as `read_named` has it."""
     return NamedDrawing(whole.record("info").size("width", "height"), map(_shape, whole.records("objects", "object")))
 
 

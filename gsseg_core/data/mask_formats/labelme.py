@@ -12,8 +12,7 @@ import io
 import numpy as np
 import numpy.typing as npt
 
-from gsseg_core.data.mask_formats.masks import MaskSet
-from gsseg_core.data.mask_formats.named import NamedDrawing, NamedShape, read_named
+from gsseg_core.data.mask_formats.named import NamedDrawing, NamedShape
 from gsseg_core.data.mask_formats.place import Place
 from gsseg_core.data.mask_formats.record import Record
 from gsseg_core.data.mask_formats.shapes import Bitmap, Polygons, Region
@@ -33,12 +32,8 @@ def is_labelme(place: Place) -> bool:
     return "imagePath" in content or "imageHeight" in content
 
 
-def read_labelme(place: Place) -> MaskSet:
-    """Read LabelMe."""
-    return read_named(place, _parse)
-
-
-def _parse(whole: Record) -> NamedDrawing:
+def parse_labelme(whole: Record) -> NamedDrawing:
+    """Read the shapes of an image, as `read_named` has it."""
     size = whole.size("imageWidth", "imageHeight")
     return NamedDrawing(size, (NamedShape(s.class_name("label"), _region(s)) for s in whole.records("shapes", "shape")))
 

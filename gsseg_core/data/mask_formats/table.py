@@ -9,6 +9,7 @@ import re
 from collections.abc import Callable, Iterable
 from contextlib import suppress
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 
 from gsseg_core.data.label_images import mask_header
@@ -16,10 +17,11 @@ from gsseg_core.data.mask_files import CLASS_ID, DETECTIONS, mask_files, masks_b
 from gsseg_core.data.mask_formats.coco import is_coco, read_coco
 from gsseg_core.data.mask_formats.cvat import is_cvat, read_cvat
 from gsseg_core.data.mask_formats.eiseg import is_eiseg, read_eiseg
-from gsseg_core.data.mask_formats.grounded_sam import is_grounded_sam, read_grounded_sam
-from gsseg_core.data.mask_formats.isat import is_isat, read_isat
-from gsseg_core.data.mask_formats.labelme import is_labelme, read_labelme
+from gsseg_core.data.mask_formats.grounded_sam import is_grounded_sam, parse_grounded_sam
+from gsseg_core.data.mask_formats.isat import is_isat, parse_isat
+from gsseg_core.data.mask_formats.labelme import is_labelme, parse_labelme
 from gsseg_core.data.mask_formats.masks import MaskSet
+from gsseg_core.data.mask_formats.named import read_named
 from gsseg_core.data.mask_formats.place import Place
 from gsseg_core.data.mask_formats.sam import METADATA, is_sam_folder, is_sam_json, read_sam_folder, read_sam_json
 from gsseg_core.data.mask_formats.sam2 import is_sam2, read_sam2
@@ -66,16 +68,16 @@ MASK_FORMATS = [
         "those of the objects", "the smaller id",
     ),
     MaskFormat(
-        "LabelMe", is_labelme, read_labelme, "`<stem>.json` with `shapes` and `imagePath`",
+        "LabelMe", is_labelme, partial(read_named, parse=parse_labelme), "`<stem>.json` with `shapes` and `imagePath`",
         "from 1, names from A to Z", "the last shape",
     ),
     MaskFormat(
-        "ISAT (LERF)", is_isat, read_isat, "`<stem>.json` with `info` and `objects`",
+        "ISAT (LERF)", is_isat, partial(read_named, parse=parse_isat), "`<stem>.json` with `info` and `objects`",
         "from 1, names from A to Z", "the higher `layer`",
     ),
     MaskFormat(
-        "Grounded SAM 2", is_grounded_sam, read_grounded_sam, "`<stem>.json` with `annotations` and `img_width`",
-        "from 1, names from A to Z", "the smaller mask",
+        "Grounded SAM 2", is_grounded_sam, partial(read_named, parse=parse_grounded_sam),
+        "`<stem>.json` with `annotations` and `img_width`", "from 1, names from A to Z", "the smaller mask",
     ),
     MaskFormat(
         "CVAT", is_cvat, read_cvat, "an XML file of CVAT for images 1.1",
