@@ -17,7 +17,11 @@ from gsseg_core.errors import SettingsError
 from gsseg_core.text import counted
 
 if TYPE_CHECKING:
+    from gsseg_core.data.dataset import Dataset
+    from gsseg_core.data.view import View
+    from gsseg_core.segmentation import Segmentation
     from gsseg_core.viewer.access import Listener
+    from gsseg_core.viewer.learnt_views import LearntFrom
 
 DESCRIPTION = """
 Serves a page in which the scene is drawn in true colours, by class or by confidence; classes can be shown alone,
@@ -59,7 +63,6 @@ def run(options: argparse.Namespace) -> int:
 
 
 def _show(options: argparse.Namespace, listener: Listener, viewer_module: ModuleType) -> int:
-    from gsseg_core.objects.object_table import object_name
     from gsseg_core.scene.gaussian_scene import GaussianScene
     from gsseg_core.segmentation import Segmentation
     from gsseg_core.viewer.learnt_views import LearntFrom
@@ -79,14 +82,7 @@ def _show(options: argparse.Namespace, listener: Listener, viewer_module: Module
     if dataset and not options.ros:  # The node's ids are as they are.
         class_ids = class_ids or list(dataset.class_ids)
         dataset = dataset.numbered(class_ids)
-    views = learnt.views(dataset) if dataset else []
-    if dataset and not views:
-        note(f"there are no views to jump to: found no mask of a train view in {Path(options.data) / learnt.labels}")
-    found = segmentation and any(name == object_name(k) for k, name in segmentation.class_names.items() if k)
-    if views and found and learnt.report is None:
-        # As of one that was saved from the viewer. Its masks would be shown as objects that they are not.
-        note(f"there are no views to jump to: no report.json beside {options.segmentation} says what ids of masks are")
-        views = []
+    views = _views(options, learnt, dataset, segmentation) if dataset else []
     read = segmentation.numbered() if segmentation else None
     labelling = Labelling.of(read) if read else Labelling.unknown(len(scene), dataset.class_names if dataset else None)
     source = open_source("ros", scene) if options.ros else None
@@ -105,6 +101,25 @@ def _show(options: argparse.Namespace, listener: Listener, viewer_module: Module
             webbrowser.open(viewer.url)
         threading.Event().wait()
     return 0
+
+
+def _views(
+    options: argparse.Namespace, learnt: LearntFrom, dataset: Dataset, segmentation: Segmentation | None
+) -> list[View]:
+    """List the views to jump to; where there are none, say why."""
+    from gsseg_core.objects.object_table import object_name
+
+    views = learnt.views(dataset)
+    found = segmentation and any(name == object_name(k) for k, name in segmentation.class_names.items() if k)
+    if not views:
+        why = f"found no mask of a train view in {Path(options.data) / learnt.labels}"
+    elif found and learnt.report is None:
+        # As of one that was saved from the viewer. Its masks would be shown as objects that they are not.
+        why = f"no report.json beside {options.segmentation} says what ids of masks are"
+    else:
+        return views
+    note(f"there are no views to jump to: {why}")
+    return []
 
 
 def load_viewer() -> ModuleType:
