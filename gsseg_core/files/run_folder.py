@@ -181,8 +181,8 @@ def _finish(out: Path) -> None:
     staging, before, run_id = out / manifest.staging, manifest.before, manifest.staging.removeprefix(".gsseg-")
     try:
         places = {place for run in manifest.runs.values() for place in run.files}
-        # Others were moved already, or are of another kind.
-        new = sorted(place for place in places if os.path.lexists(staging / "new" / place))
+        # Others were moved already, or are of another kind. A link in a folder of a stranger may lead anywhere.
+        new = sorted(place for place in places if _lies_in(out, f"{manifest.staging}/new/{place}"))
         gone = before.keys() - places
         for folder in sorted({folder for place in new for folder in Path(place).parents[:-1]}):  # the outermost first
             if os.path.lexists(out / folder) and not _is_folder(out / folder):

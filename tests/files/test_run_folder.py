@@ -296,6 +296,24 @@ INFINITE = (
 )
 
 
+@pytest.mark.parametrize("linked", ["", "new", "new/classes"])
+def test_a_strangers_folder_that_claims_a_cut_short_move_takes_no_files_from_elsewhere(
+    tmp_path: Path, linked: str
+) -> None:
+    out, mine, name = tmp_path / "out", tmp_path / "mine", ".gsseg-20260101T000000Z-01234567"
+    (mine / "new/classes").mkdir(parents=True)
+    (mine / "new/classes/1_cup.ply").write_text("mine")
+    link = out / name / linked
+    link.parent.mkdir(parents=True)
+    link.symlink_to(mine / linked)
+    places = json.dumps({"classes/1_cup.ply": {"size": 4, "mtime_ns": 0, "sha256": ""}})
+    (out / COMMIT_FILE).write_text(
+        f'{{"format": "gsseg-run-1", "staging": "{name}", "runs": {{"segment": {{"run": "r", "files": {places}}}}}}}'
+    )
+    settle(out)
+    assert (mine / "new/classes/1_cup.ply").read_text() == "mine" and not (out / "classes").exists()
+
+
 @pytest.mark.parametrize("text", ["{", "[]", '{"format": "gsseg-run-1"}', '{"format": "other"}', "\udc80", INFINITE])
 def test_a_broken_manifest_makes_the_files_somebody_elses(tmp_path: Path, text: str) -> None:
     write(tmp_path, FIRST)
