@@ -58,7 +58,7 @@ class GaussianScene:
     scales : ndarray (N, 3) float32
         Standard deviations along the local axes, in scene units, > 0. Limited to exp(-40)..exp(40).
     opacities : ndarray (N,) float32
-        In (0, 1). Logits are limited to -16..16.
+        In (0, 1). Logits, which may be infinite, are limited to -16..16.
     vertices : ndarray (N,) structured
         The PLY vertices as read, all properties: what `subset` and `save` carry on exactly.
     path : pathlib.Path or None
@@ -86,7 +86,8 @@ class GaussianScene:
         ScenePropertyError
             Properties of 3DGS are missing or are lists.
         SceneValueError
-            Values are NaN or infinite, or quaternions are zero.
+            Values are NaN or infinite, but for logits of opacities 0 and 1 and the logarithm of a scale of 0, or
+            quaternions are zero.
         EmptySceneError
             There is no Gaussian.
         PathNotAllowedError
@@ -155,12 +156,14 @@ class GaussianScene:
         if len(vertices) == 0:
             raise EmptySceneError(f"{source}: holds no Gaussian (0 vertices); expected at least one")
         if not _all_within(vertices, min(_FLOAT32_MAX, LIMITS.max_value)):
-            for names, what, most in (
-                (OPACITY, "opacities", _FLOAT32_MAX), (SCALES, "scales", _FLOAT32_MAX),
-                (QUATS, "rotations", _FLOAT32_MAX), (MEANS, "positions", LIMITS.max_value),
-                (sh_names, "SH coefficients", LIMITS.max_value),
+            most, finite = LIMITS.max_value, _FLOAT32_MAX
+            for names, what, low, high in (
+                # Converters from bytes write logits of opacities 0 and 1, and the logarithm of a scale of 0.
+                (OPACITY, "opacities", -np.inf, np.inf), (SCALES, "scales", -np.inf, finite),
+                (QUATS, "rotations", -finite, finite), (MEANS, "positions", -most, most),
+                (sh_names, "SH coefficients", -most, most),
             ):  # fmt: skip
-                _check_finite(columns(vertices, names), what, source, most)
+                _check_within(columns(vertices, names), what, source, low, high)
         means, quats, scales, opacities = _activated(vertices)
         zero = np.flatnonzero(np.isnan(quats[:, 0]))
         if zero.size:
@@ -298,10 +301,14 @@ def _activated(vertices: npt.NDArray[np.void]) -> tuple[npt.NDArray[np.float32],
     return means, quats, scales, opacities[:, 0]
 
 
-def _check_finite(values: npt.NDArray[np.float32], what: str, source: str, most: float) -> None:  # (N, C)
-    if values.size and not (values.min() >= -most and values.max() <= most):
-        bad = np.flatnonzero(~(np.abs(values) <= most).all(axis=1))
+def _check_within(
+    values: npt.NDArray[np.float32],  # (N, C)
+    what: str, source: str, low: float, high: float
+) -> None:  # fmt: skip
+    if values.size and not (values.min() >= low and values.max() <= high):
+        bad = np.flatnonzero(~((values >= low) & (values <= high)).all(axis=1))
         raise SceneValueError(
             f"{source}: {bad.size} of {len(values)} Gaussians have NaN, infinite or too large {what} "
-            f"(first at index {bad[0]}); expected finite numbers, at most {most:.3g} in size (limit max_value)"
+            f"(first at index {bad[0]}); expected finite numbers, at most {min(high, _FLOAT32_MAX):.3g} in size (limit "
+            "max_value); splat-transform's --filter-nan leaves out Gaussians that are NaN or infinite"
         )

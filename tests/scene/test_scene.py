@@ -15,7 +15,7 @@ from hypothesis import strategies as st
 from test_ply import ENCODINGS, write_ply
 
 from gsseg_core.errors import EmptySceneError, SceneFileError, ScenePropertyError, SceneValueError, WriteError
-from gsseg_core.scene.gaussian_scene import GaussianScene
+from gsseg_core.scene.gaussian_scene import ACTIVATED, GaussianScene
 from gsseg_core.scene.ply import read_vertices
 from gsseg_core.scene.spherical_harmonics import C0
 from gsseg_core.scene.vertices import BLOCK
@@ -236,6 +236,18 @@ def test_an_odd_number_of_sh_coefficients_is_refused(tmp_path: Path, names: list
         GaussianScene.load(write_ply(tmp_path / "in.ply", vertices))
 
 
+def test_opacities_and_scales_of_0_and_1_may_be_infinite_as_logits_and_logarithms(tmp_path: Path) -> None:
+    vertices, finite = random_vertices(6), random_vertices(6)
+    vertices["opacity"][[2, 4]], finite["opacity"][[2, 4]] = (np.inf, -np.inf), (16, -16)
+    vertices["scale_1"][3], finite["scale_1"][3] = -np.inf, -40
+    scene = GaussianScene.load(write_ply(tmp_path / "in.ply", vertices))
+    expected = GaussianScene.load(write_ply(tmp_path / "finite.ply", finite))
+    for name in ACTIVATED:
+        np.testing.assert_array_equal(getattr(scene, name), getattr(expected, name))
+    scene.save(tmp_path / "out.ply")
+    assert read_vertices(tmp_path / "out.ply").tobytes() == vertices.tobytes()
+
+
 @pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf])
 @pytest.mark.parametrize(
     ("name", "what"),
@@ -253,6 +265,8 @@ def test_nan_and_infinity_are_refused_with_count_and_place(
     tmp_path: Path, name: str, what: str, value: float, encoding: str
 ) -> None:
     vertices = random_vertices(6)
+    if name == "opacity" or (name == "scale_2" and value < 0):
+        value = np.nan  # What is infinite is an opacity of 0 or 1, or a scale of 0.
     vertices[name][[2, 4]] = value
     with pytest.raises(SceneValueError) as caught:
         GaussianScene.load(write_ply(tmp_path / "in.ply", vertices, encoding))
