@@ -160,11 +160,12 @@ def examine_scene(path: str) -> list[Finding]:
 def examine_dataset(path: str, labels: str) -> list[Finding]:
     """Read the cameras and all masks of a dataset, and say what is there; nothing of a scene.
 
-    Raises what `Dataset` and `View.read_seen` raise, with where a scene lies in a folder that has no cameras.
+    Raises what `Dataset` and `View.read_labels` raise, with where a scene lies in a folder that has no cameras.
     """
     from gsseg_core.data.camera_files import find_cameras, read_cameras
     from gsseg_core.data.dataset import Dataset
     from gsseg_core.data.hints import mask_hint
+    from gsseg_core.data.label_images import EXPECTED_IDS
     from gsseg_core.scene.scene_formats import find_format, scene_hint
     from gsseg_core.text import clipped, counted, masks_line
 
@@ -178,8 +179,7 @@ def examine_dataset(path: str, labels: str) -> list[Finding]:
         return []
     dataset, name = Dataset(path, labels), clipped(path)
     masked = [view for view in dataset.views() if view.has_mask]
-    for view in masked:
-        view.read_seen()
+    ids = {0}.union(*(view.class_ids() for view in masked))
     train, test = (len(dataset.views(split)) for split in ("train", "test"))
     rest = len(dataset.views()) - train - test
     unused = f", {rest} for neither: split.json names them nowhere, or not as train or test" if rest else ""
@@ -187,6 +187,8 @@ def examine_dataset(path: str, labels: str) -> list[Finding]:
     if not masked:
         hint = mask_hint(Path(path), labels, [view.camera.image for view in dataset.views()])
         told, mark, fix = f"none in {clipped(labels)}", "-", hint.removeprefix("; ")
+    elif ids == {0}:
+        told, mark, fix = f"of {counted(len(masked), 'view')}; none of them names an object", "-", EXPECTED_IDS
     described = dataset.describe_masks()
     return [
         Finding(name, "cameras", f"{found[0].name}: {train} to learn from, {test} to test{unused}"),

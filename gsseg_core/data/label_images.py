@@ -30,6 +30,12 @@ UNKNOWN = -1
 
 DIGEST_BYTES = 16  # of a mask, or a view: no two of a fleet will ever share them by chance
 
+EXPECTED_IDS = (
+    "expected ids from 1, as 1 and not 255 for a single object: 0 is the background and 255 (in masks of 16 bits "
+    "65535) unknown; detections of 8 bits are 0 to 255, not 0 and 1"
+)
+"""What messages say where masks name no object."""
+
 GLOBAL = "global"
 PER_VIEW = "per-view"
 IDS = (GLOBAL, PER_VIEW)

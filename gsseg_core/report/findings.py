@@ -9,6 +9,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from gsseg_core.data.class_names import NOTED, class_name, listed
+from gsseg_core.data.label_images import EXPECTED_IDS
 from gsseg_core.data.view import View
 from gsseg_core.learn.mask_reliability import ViewCheck, sum_cells
 from gsseg_core.learn.renamed_ids import renamed_note
@@ -20,10 +21,7 @@ TRUSTED = 0.7  # the page warns of masks with which the other views agree in a s
 KNOWN_CLASS = 0.5  # ... and of classes whose IoU with the masks is smaller than this
 FEW_VIEWS = 3
 _SHADES, _HARDLY_ANY = 32, 10  # so many ids of fewer Gaussians than that are shades of grey
-NO_OBJECTS = (
-    "the masks name none, or contradict each other; expected ids from 1, as 0 is the background and 255 (in masks of "
-    "16 bits 65535) unknown; detections of 8 bits are 0 to 255, not 0 and 1"
-)
+NO_OBJECTS = f"the masks name none, or contradict each other; {EXPECTED_IDS}"
 
 
 class Confusion(NamedTuple):

@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from mask_writers import sam_json
+from PIL import Image
 from scene_files import some_scene, write_glb, write_gsplat, write_spz
 from small_scenes import NAMES, NUM_CLASSES, balls_on_a_table, clean_views, taught, write_dataset
 
@@ -124,6 +125,17 @@ def test_doctor_reads_all_masks_of_a_dataset_and_says_that_it_looked_at_no_scene
     shutil.rmtree(mask.parent)
     assert main(["doctor", str(root)]) == 0
     assert "none in labels" in capsys.readouterr().out
+
+
+def test_doctor_says_so_where_masks_name_no_object_as_those_of_0_and_255_do(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    root = write_dataset(tmp_path / "data")
+    for path in (root / "labels").iterdir():
+        Image.fromarray(np.uint8(255 * (np.array(Image.open(path)) > 0))).save(path)
+    assert main(["doctor", str(root)]) == 0
+    told = capsys.readouterr().out
+    assert "of 6 views; none of them names an object" in told and "as 1 and not 255 for a single object" in told
 
 
 def test_a_scene_of_another_format_is_segmented_as_its_ply_is(tmp_path: Path) -> None:
