@@ -193,10 +193,33 @@ def test_a_folder_of_a_view_without_images_of_classes_says_what_is_there(
     assert "labels/view0: holds no detections, but mask.jpg, mask.json; expected" in error_of(capsys, data)
 
 
-def test_label_studios_own_file_is_told_from_what_it_exports(data: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    (data / "project.json").write_text(json.dumps([{"id": 1, "annotations": [], "data": {"image": "a.jpg"}}]))
-    error = error_of(capsys, data, "--labels", "project.json")
-    assert "no file of masks that is known, but Label Studio's own: export it as COCO; gsseg reads" in error
+@pytest.mark.parametrize(
+    ("content", "told"),
+    [
+        (
+            [{"id": 1, "annotations": [], "data": {"image": "a.jpg"}}],
+            "but Label Studio's own: export it as COCO; gsseg",
+        ),
+        ([{"id": 1, "image": "a.jpg", "annotation_id": 3, "lead_time": 2.5}], "but Label Studio's own: export it"),
+        ({"size": {"height": 1, "width": 1}, "objects": []}, "but Supervisely's: export it as COCO; gsseg reads"),
+        ({"a.jpg77": {"filename": "a.jpg", "size": 77, "regions": []}}, "but VIA's: export it as COCO; gsseg reads"),
+        ([{"image_id": 1, "category_id": 2, "score": 0.9}], "but COCO's results alone: expected a whole file"),
+    ],
+)
+def test_files_of_masks_that_are_not_read_are_refused_with_whose_they_are_and_what_to_do(
+    data: Path, capsys: pytest.CaptureFixture[str], content: object, told: str
+) -> None:
+    (data / "project.json").write_text(json.dumps(content))
+    assert f"no file of masks that is known, {told}" in error_of(capsys, data, "--labels", "project.json")
+
+
+def test_masks_of_sam_as_pixels_are_refused_with_what_to_have_it_write(
+    data: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (data / "sam").mkdir()
+    (data / "sam/view0.json").write_text(json.dumps([{"segmentation": [[True]], "predicted_iou": 0.9}]))
+    error = error_of(capsys, data, "--labels", "sam", "--ids", "per-view")
+    assert "view0.json, mask 0: 'segmentation' lists pixels or points; expected RLE (output_mode='coco_rle'" in error
 
 
 def test_photos_in_the_place_of_masks_are_refused_as_photos(data: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -104,6 +104,11 @@ def _drawing(path: Path, content: object) -> Drawing:
     regions: list[Runs] = []
     sizes: set[tuple[int, int]] = set()
     for mask in records(_listed(content), str(path), f"{path}, mask"):
+        if isinstance(mask.value("segmentation"), list):
+            raise MaskFormatError(
+                f"{mask.where}: 'segmentation' lists pixels or points; expected RLE (output_mode='coco_rle' of SAM's "
+                "generator, not 'binary_mask')"
+            )
         runs = mask.record("segmentation")
         size = runs.value("size")
         if not isinstance(size, list) or len(size) != 2 or any(type(side) is not int or side < 1 for side in size):

@@ -94,6 +94,15 @@ MASK_FORMATS = [
 ]  # fmt: skip
 """All formats; a new one is added here."""
 
+# JSON that is not read, by fields of its first record: whose it is, and what to do.
+_FOREIGN = [
+    ({"annotations", "data"}, "Label Studio's own: export it as COCO"),
+    ({"annotation_id", "lead_time"}, "Label Studio's own: export it as COCO"),
+    ({"objects", "size"}, "Supervisely's: export it as COCO"),
+    ({"filename", "regions"}, "VIA's: export it as COCO"),
+    ({"image_id", "category_id"}, "COCO's results alone: expected a whole file, with `images` and `categories`"),
+]
+
 
 def open_masks(
     path: Path, stems: Iterable[str], within: Path | None = None, depth: int = Place.depth
@@ -121,9 +130,7 @@ def open_masks(
                 "or a folder without the others"
             )
         if not found and (unknown := _unknown(place)):
-            first = next(iter(place.sample[1]), None) if isinstance(place.sample[1], list) else None
-            is_studio = isinstance(first, dict) and {"annotations", "data"} <= first.keys()
-            hint = ", but Label Studio's own: export it as COCO" if is_studio else ""
+            hint = _foreign_hint(place.sample[1])
             raise MaskFormatError(f"{unknown}: is no file of masks that is known{hint}; gsseg reads {known_formats()}")
         masks = found[0].read(place) if found else None
     except RecursionError as cause:
@@ -143,6 +150,13 @@ def known_formats() -> str:
     """List all formats for messages."""
     own = f"{LABEL_IMAGES} (a folder of <stem>.png)"
     return ", ".join([own, *(f"{known.name} ({known.looked_for.replace('`', '')})" for known in MASK_FORMATS)])
+
+
+def _foreign_hint(content: object) -> str:
+    """Say whose a JSON file is that is not read, and what to do, if its first record tells."""
+    listed = content if isinstance(content, list) else [content, *content.values()] if isinstance(content, dict) else []
+    fields = [record.keys() for record in listed[:2] if isinstance(record, dict)]
+    return next((f", but {told}" for marks, told in _FOREIGN if any(marks <= keys for keys in fields)), "")
 
 
 def _unknown(place: Place) -> Path | None:
