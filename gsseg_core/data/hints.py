@@ -6,6 +6,7 @@ The folder was refused already; a hint tells of cameras or masks that lie near t
 from __future__ import annotations
 
 import os
+import re
 import shlex
 from collections.abc import Callable, Collection
 from contextlib import suppress
@@ -24,8 +25,12 @@ from gsseg_core.files.input_files import READABLE_IMAGES
 _FOREIGN_CAMERAS = {
     "transforms_train.json": "its cameras are nerfstudio's: copy it to transforms.json, with the image size as w and h",
     "poses_bounds.npy": "it is LLFF's: run nerfstudio's ns-process-data, or COLMAP, on the photos",
+    "cameras.xml": "it is Metashape's: run nerfstudio's ns-process-data metashape on it",
+    "sfm_data.json": "it is OpenMVG's: run openMVG_main_openMVG2Colmap -i sfm_data.json -o sparse",
+    "reconstruction.json": "it is OpenSfM's: run opensfm export_colmap on its folder",
     "mesh_info.json": "it is Polycam's raw data: run nerfstudio's ns-process-data polycam on it",
     "database.db": "it is COLMAP's database without a model: run `colmap mapper`, and give the folder with its sparse/",
+    "metadata.json": "if it is Record3D's, run nerfstudio's ns-process-data record3d on the folder",
 }
 _MODELS = (("cameras.bin", "images.bin"), ("cameras.txt", "images.txt"))  # COLMAP's, what is read of them
 FRAME_HINT = (
@@ -33,6 +38,7 @@ FRAME_HINT = (
     "scene is nearer to the cameras than 0.01 of its units, where nothing is drawn"
 )
 _MASKS = READABLE_IMAGES | {".npy", ".npz", ".json"}
+_OF_MASKS = re.compile("mask|label|seg|^ann", re.IGNORECASE)  # what people call folders of masks
 _MORE = "docs/masks.md has all forms"
 _DEPTH = 3
 _MOST_FOLDERS, _MOST_FILES = 200, 20
@@ -56,7 +62,9 @@ def camera_hint(folder: Path) -> str:
         with suppress(GssegError):
             if found := known.find_in(below):
                 # ns-process-data writes cameras into a sub-folder, and masks lie here: a link puts the two together.
-                place = folder / (known.folders[-1] if known.folders else found.name)
+                # Where there is a folder sparse/ already, with sparse/1 in it, a link of this name would go into it.
+                free = [name for name in known.folders[::-1] if not (folder / name).is_dir()]
+                place = folder / next(iter([*free, found.name]))
                 return f"; found cameras in {found}: type ln -s {_quoted(found.resolve())} {_quoted(place)}"
     for name, advice in _FOREIGN_CAMERAS.items():
         if (folder / name).is_file():
@@ -94,8 +102,13 @@ def mask_hint(root: Path, labels: str, stems: Collection[str]) -> str:
         return f"{looked}, found {count} masks of these names in {where}: type --labels {shlex.quote(name)}"
     if (root / labels).is_symlink() and not (root / labels).exists():
         return f"{looked}, but {labels} is a link to {os.readlink(root / labels)}, which does not exist"
+    expected = f"label images as PNG, and probabilities as {stem}.npz or {stem}/<class id>.tif ({_MORE})"
     if not (root / labels).is_dir():
-        photos = [path.name for path in _folders(root) if _stems(path) & set(stems)]
+        folders = [path for path in _folders(root) if _stems(path) & set(stems)]
+        if folder := next((path for path in folders if _OF_MASKS.search(path.name)), None):
+            name = min(path.name for path in folder.iterdir() if path.stem in stems)
+            return f"{looked}, but {folder.relative_to(root)}/ holds files such as {name}; expected {expected}"
+        photos = [path.name for path in folders]
         hint = f" ({photos[0]}/ holds photos; a 2D segmenter makes masks of them)" if photos else ""
         return f"{looked}, but there is no folder {labels}/{hint}"
     there = sorted(path for path in (root / labels).iterdir() if path.name != SUPERVISES)
@@ -103,7 +116,6 @@ def mask_hint(root: Path, labels: str, stems: Collection[str]) -> str:
     if not found:
         return f"{looked}, but {labels}/ holds no mask"
     if found[0].is_file() and found[0].suffix.lower() not in (".png", ".npz"):
-        expected = f"label images as PNG, and probabilities as {stem}.npz or {stem}/<class id>.tif ({_MORE})"
         return f"{looked}, but {labels}/ holds files such as {found[0].name}; expected {expected}"
     wrong = f"{looked}, but {labels}/ holds names such as {found[0].name}"
     if sum(path.stem.startswith((f"{stem}_", f"{stem}-")) for path in found) > 1:

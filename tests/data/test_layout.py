@@ -97,6 +97,13 @@ def other_files(data: Path) -> None:
         path.rename(path.with_suffix(".tif"))
 
 
+def other_files_beside(data: Path) -> None:
+    other_files(data)
+    (data / "labels").rename(data / "masks")
+    (data / "images").mkdir()
+    (data / "images/view0.png").touch()
+
+
 def by_class(data: Path) -> None:
     for path in list((data / "labels").iterdir()):
         for label in (1, 2):
@@ -128,6 +135,10 @@ def emptied(data: Path) -> None:
         (photos, "there is no folder labels/ (images/ holds photos; a 2D segmenter makes masks of them)"),
         (other_names, "labels/ holds names such as view0_seen.png: rename them"),
         (other_files, "labels/ holds files such as view0.tif; expected label images as PNG, and probabilities as view"),
+        (
+            other_files_beside,
+            "masks/ holds files such as view0.tif; expected label images as PNG, and probabilities as",
+        ),
         (by_class, "labels/ has a folder for each class, such as 1/: make one for each view, labels/view"),
         (other_detections, "labels/ holds names such as view0_objects: rename them"),
         (one_for_each_object, "view0_1.png, several of a view: make a folder for each view, labels/view0/"),
@@ -230,14 +241,14 @@ def test_photos_in_the_place_of_masks_are_refused_as_photos(data: Path, capsys: 
 
 @pytest.mark.parametrize(
     ("file", "link"),
-    [("colmap/sparse/7/cameras.bin", "sparse"), ("a/b/cameras.json", "cameras.json"),
-     ("model/transforms.json", "transforms.json")],
+    [("colmap/sparse/7/cameras.bin", "sparse"), ("sparse/1/cameras.bin", "sparse/0"),
+     ("a/b/cameras.json", "cameras.json"), ("model/transforms.json", "transforms.json")],
 )  # fmt: skip
 def test_cameras_below_the_masks_are_linked_to_where_they_are_read(data: Path, file: str, link: str) -> None:
     (data / "cameras.json").unlink()
     (data / file).parent.mkdir(parents=True)
     (data / file).touch()
-    source = (data / file).parent if link == "sparse" else data / file
+    source = (data / file).parent if "sparse" in link else data / file
     assert camera_hint(data).endswith(f"type ln -s {source} {data}/{link}")
 
 
@@ -270,6 +281,10 @@ def test_a_colmap_model_in_the_folder_itself_is_linked_to_where_it_is_read(tmp_p
         ("poses_bounds.npy", "LLFF"),
         ("database.db", "mapper"),
         ("mesh_info.json", "ns-process-data polycam"),
+        ("cameras.xml", "ns-process-data metashape"),
+        ("sfm_data.json", "openMVG_main_openMVG2Colmap"),
+        ("reconstruction.json", "opensfm export_colmap"),
+        ("metadata.json", "ns-process-data record3d"),
     ],
 )
 def test_cameras_of_other_programs_are_recognised(tmp_path: Path, name: str, told: str) -> None:
