@@ -126,6 +126,8 @@ def read_scene(path: str | os.PathLike[str], within: Path | None = None) -> Read
             what = f"{path}: cannot be read ({reason(error)}); expected a {scene_format.name}"
         formats = ", ".join(f"{known.name} ({known.looked_for})" for known in SCENE_FORMATS)
         known = "" if suited or os.path.isdir(path) else f"; gsseg reads {formats}"
+        if known and path.suffix.lower() in (".usd", ".usda", ".usdc"):
+            known = "; gsseg writes USD, and does not read it: give the scene that it was made from"
         hint = scene_hint(path) if within is None else ""  # It looks around, wherever links lead.
         raise SceneFileError(f"{what}{known}{hint}") from error
 

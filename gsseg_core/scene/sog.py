@@ -50,6 +50,9 @@ def read_sog(path: Path, within: Path | None = None) -> ReadScene:
                 read_json(path, SceneFileError, within), lambda name, most: _beside(path, name, most, within)
             )
         with zipfile.ZipFile(file) as archive:
+            if _META not in archive.namelist():
+                found = quoted(", ".join(archive.namelist()))
+                raise UnfitError(f"is a zip of {found}, without SOG's {_META}: unpack it, and give the scene in it")
             content = json.loads(_member(archive, _META, LIMITS.max_json_bytes))
             return _decode(content, lambda name, most: _member(archive, name, most))
 

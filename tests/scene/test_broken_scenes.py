@@ -147,6 +147,14 @@ def test_without_zstandard_version_4_names_the_extra(tmp_path: Path, monkeypatch
     refuse(tmp_path / "a.spz", r"takes the package zstandard: pip install 'gsseg\[formats\]'")
 
 
+def test_a_zip_with_a_scene_in_it_and_usd_are_refused_with_what_to_give_instead(tmp_path: Path) -> None:
+    with zipfile.ZipFile(tmp_path / "scan.zip", "w") as archive:
+        archive.writestr("scan/point_cloud.ply", b"ply\n")
+    refuse(tmp_path / "scan.zip", r"is a zip of 'scan/point_cloud\.ply', without SOG's meta\.json: unpack it, and give")
+    (tmp_path / "objects.usda").write_text("#usda 1.0\n")
+    refuse(tmp_path / "objects.usda", "gsseg writes USD, and does not read it: give the scene that it was made from$")
+
+
 def changed_sog(path: Path, **members: bytes) -> None:
     """SOG with members replaced; `meta` stands for meta.json, other names for WebP images."""
     scene_files.write_sog_1(path, some_scene(100, 1))
