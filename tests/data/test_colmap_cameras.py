@@ -82,6 +82,20 @@ def test_colmap_images_in_text_may_have_their_columns_aligned(tmp_path: Path) ->
     assert second.name == "0002"
 
 
+@pytest.mark.parametrize("end", ["\n\n", "\n", ""])
+def test_the_last_colmap_image_in_text_counts_though_nothing_follows_it(tmp_path: Path, end: str) -> None:
+    images = write_colmap(tmp_path / "sparse" / "0", text=True) / "images.txt"
+    images.write_text("1 1 0 0 0 0 0 0 7 a.jpg\n\n2 1 0 0 0 0 0 0 7 b.jpg" + end)
+    assert [camera.name for camera in read_cameras(tmp_path)] == ["a", "b"]
+
+
+def test_colmap_images_in_text_without_lines_of_points_are_refused(tmp_path: Path) -> None:
+    images = write_colmap(tmp_path / "sparse" / "0", text=True) / "images.txt"
+    images.write_text("1 1 0 0 0 0 0 0 7 a.jpg\n2 1 0 0 0 0 0 0 7 b.jpg\n3 1 0 0 0 0 0 0 7 c.jpg\n")
+    words = ("images.txt: after image 'a.jpg' comes '2 1 0 0 0 0 0 0 7 b.jpg", "expected its points, or an empty line")
+    assert_refused(tmp_path, CameraFileError, *words)
+
+
 def test_colmap_images_of_one_name_after_their_folders_too_are_refused(tmp_path: Path) -> None:
     write_colmap(tmp_path / "sparse" / "0", ("a/b_1.jpg", "a_b/1.jpg", "c/1.jpg"))
     assert_refused(tmp_path, CameraFileError, "2 images have the stem 'a_b_1'")

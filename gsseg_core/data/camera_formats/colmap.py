@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import re
 import shutil
 import struct
 import tempfile
@@ -14,10 +15,10 @@ import numpy as np
 
 from gsseg_core.data.camera_formats.entries import Intrinsics, cameras_of, stem_of
 from gsseg_core.errors import CameraFileError, IntrinsicsError, PoseError
-from gsseg_core.files.input_files import is_there, open_input, reason
+from gsseg_core.files.input_files import UnfitError, is_there, open_input, reason
 from gsseg_core.scene.camera import Camera
 from gsseg_core.scene.lens import MODELS_BY_NAME
-from gsseg_core.text import clipped
+from gsseg_core.text import clipped, quoted
 
 if TYPE_CHECKING:
     import pycolmap
@@ -86,6 +87,8 @@ def _load(path: Path, within: Path | None) -> pycolmap.Reconstruction:
                     copy(source, target)
             except OSError as error:
                 raise CameraFileError(f"{file}: cannot be read ({reason(error)})") from error
+            except UnfitError as error:
+                raise CameraFileError(f"{file}: {error}") from error
             except (struct.error, ValueError) as error:
                 raise CameraFileError(f"{file}: is truncated; expected a whole COLMAP model") from error
         (Path(folder) / f"points3D{suffix}").write_bytes(bytes(8) if suffix == ".bin" else b"")
@@ -132,10 +135,16 @@ def _copy_images(source: BinaryIO, target: BinaryIO) -> None:
 def _copy_images_of_text(source: BinaryIO, target: BinaryIO) -> None:
     """Copy a list of images in text, each in two lines; spaces in names are replaced, as pycolmap would end them there.
 
-    COLMAP itself writes such names.
+    COLMAP itself writes such names. Raises `UnfitError` where no line of points follows an image.
     """
     for line in source:
         if (image := line.strip()) and not image.startswith(b"#"):
             *pose, name = image.split(None, 9)
-            line = b" ".join([*pose, name.replace(b" ", _SPACE.encode())]) + b"\n" + next(source, b"")
+            points = next(source, b"\n")  # pycolmap forgets an image without this line
+            if (last := points.rsplit(None, 1)[-1:]) and not re.fullmatch(rb"[-+.0-9eE]+", last[0].strip()):
+                image_name, found = (quoted(text[:60].decode(errors="replace")) for text in (name, points))
+                raise UnfitError(
+                    f"after image {image_name} comes {found}; expected its points, or an empty line if there are none"
+                )
+            line = b" ".join([*pose, name.replace(b" ", _SPACE.encode())]) + b"\n" + points
         target.write(line)
