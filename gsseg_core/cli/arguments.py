@@ -14,7 +14,7 @@ COMMANDS = {
     "segment": "learn from masks, refine, write labels and one PLY per object",
     "render": "render label maps and overlays of a segmentation",
     "eval": "score label maps: mIoU, mAcc, boundary IoU",
-    "pick": "pick one object by a mask or clicks in one view, and write it as a PLY",
+    "pick": "pick one object by its masks in a view or a few, and write it as a PLY",
     "view": "look at a scene in the browser, class by class, and correct labels",
     "remove": "write the scene without some of its objects",
     "merge": "add up what several robots have learnt of one scene",
