@@ -106,8 +106,8 @@ def test_codes_of_another_shape_than_the_observation_are_refused(backend):
         seen.shares(np.ones((5, 3), np.float32), np.ones(7, np.float32))
 
 
-@pytest.mark.parametrize("pixel", [(0, 20), (20, 0), (-1, 3), (5, -1), (3, None)])
-def test_a_pixel_outside_the_image_is_refused(backend, pixel):
+@pytest.mark.parametrize("pixel", [(0, 20), (20, 0), (-1, 3), (5, -1), (3, None), (9.5, 3), (3, 10.0)])
+def test_a_pixel_outside_the_image_or_between_two_is_refused(backend, pixel):
     operator = backend.make(one_gaussian(), make_camera(20, 20))
     with pytest.raises(SettingsError, match="expected a row from 0 to 19 and a column from 0 to 19"):
         operator.weights(*pixel)
