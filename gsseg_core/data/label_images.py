@@ -134,8 +134,8 @@ def write_mask(
 ) -> None:
     """Write a label image as a gray PNG of 8 or 16 bits, atomically (`WriteError`); `UNKNOWN` becomes 255 or 65535.
 
-    `run` is the id of the run that it belongs to, for a text in the file. Raises `MaskFormatError` where a label does
-    not fit, `SettingsError` for other bits.
+    `run` is the id of the run that it belongs to, for a text in the file. Raises `MaskFormatError` where the labels are
+    no whole numbers or one does not fit, `SettingsError` for other bits.
     """
     if bits not in (8, 16):
         raise SettingsError(f"{path}: masks of {bits} bits were asked for; expected 8 or 16")
@@ -150,6 +150,8 @@ def in_bits(
     source: str,
 ) -> npt.NDArray[np.unsignedinteger[Any]]:
     """Labels (H, W) in 8 or 16 bits, `UNKNOWN` as the largest number; `MaskFormatError` if one does not fit."""
+    if labels.dtype.kind not in "iub":  # Of probabilities nothing but zeros would be left.
+        raise MaskFormatError(f"{source}: labels are {labels.dtype}; expected whole numbers")
     unknown = 2**bits - 1
     low, high = (int(labels.min()), int(labels.max())) if labels.size else (0, 0)
     if low < UNKNOWN or high >= unknown:

@@ -125,6 +125,12 @@ def test_labels_that_do_not_fit_are_not_written(tmp_path: Path, label: int, bits
     assert not list(tmp_path.iterdir())
 
 
+def test_probabilities_are_not_written_as_labels(tmp_path: Path) -> None:
+    with pytest.raises(MaskFormatError, match="labels are float64; expected whole numbers"):
+        write_mask(tmp_path / "mask.png", np.full((2, 2), 0.9), 8)
+    assert not list(tmp_path.iterdir())
+
+
 def test_other_depths_are_not_written(tmp_path: Path) -> None:
     with pytest.raises(SettingsError, match="masks of 32 bits were asked for; expected 8 or 16"):
         write_mask(tmp_path / "mask.png", np.zeros((2, 2), np.int32), 32)
