@@ -210,9 +210,7 @@ _Form = npt.NDArray[Any] | Header
 def check_forms(probabilities: _Form, classes: _Form | None, unknown: _Form | None, source: str) -> None:
     """Raise the errors of `quantise` that types and shapes tell, of arrays or of their headers in a file."""
     if len(probabilities.shape) != 3 or probabilities.dtype.kind != "f" or not probabilities.shape[0]:
-        raise MaskFormatError(
-            f"{source}: probabilities are {Header.of(probabilities)}; expected float16 or float32 (K, H, W)"
-        )
+        raise MaskFormatError(f"{source}: probabilities are {Header.of(probabilities)}; expected floats (K, H, W)")
     count, *size = probabilities.shape
     if classes is not None and (classes.shape != (count,) or classes.dtype.kind not in "iu"):
         raise UnknownLabelError(f"{source}: classes are {Header.of(classes)}; expected {count} ids, one per map")
