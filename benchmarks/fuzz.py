@@ -41,7 +41,7 @@ FILE_KINDS = (
     "bent transforms.json", "dataparser", "labels 8 bit", "labels 16 bit", "soft npz", "mask folder", "classes.json",
     "split.json", "supervises.json", "COCO polygons", "COCO text", "SAM JSON", "SAM folders", "LabelMe polygons",
     "LabelMe masks", "ISAT", "CVAT polygons", "CVAT masks", "YOLO", "EISeg images", "EISeg polygons", "SAM 2 video",
-    "label map", "segmentation.npz", "state",
+    "Grounded SAM 2", "label map", "segmentation.npz", "state",
 )  # fmt: skip
 NODE_KINDS = (
     "mask", "camera_info", "pose", "odometry", "image", "segment", "render_view", "load_scene", "save_state",

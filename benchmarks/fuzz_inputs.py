@@ -248,6 +248,7 @@ KINDS = (
     _masks("EISeg images", "view0.png", PNG),
     _masks("EISeg polygons", "view0.json", JSON),
     _masks("SAM 2 video", "001/view0.png", PNG),
+    _masks("Grounded SAM 2", "view0.json", JSON),
     Kind("label map", _label_map, ("map.json",), JSON, ((*VOTES, "--label-map", "{data}/map.json"),)),
     Kind("segmentation.npz", _as_it_is, (SEGMENTATION,), NPZ, (RENDER, REMOVE)),
     Kind("state", _as_it_is, (STATE,), NPZ, (LOAD_STATE,)),
