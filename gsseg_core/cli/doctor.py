@@ -66,7 +66,7 @@ _ROS_MODULES = {
     "rclpy": "ROS 2 itself: source its setup file, or see the extra ros above",
     "gsseg_msgs": "the messages: pip install ./msg_defs, or in a workspace ln -s gsseg/msg_defs src/gsseg_msgs",
     "gsseg_ros": "the nodes: they come with gsseg",
-    "tf2_ros": "only for pose_source tf; apt install ros-jazzy-tf2-ros",
+    "tf2_ros": "only for poses from TF or in other frames than the map; apt install ros-jazzy-tf2-ros",
 }
 _ROS_VARIABLES = ("ROS_DISTRO", "RMW_IMPLEMENTATION", "ROS_DOMAIN_ID")
 
