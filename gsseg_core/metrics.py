@@ -145,7 +145,7 @@ class Evaluation:
         Parameters
         ----------
         class_names : mapping from label to name, optional
-            Where it lacks one, the name is `class_<label>`.
+            Where it lacks one, the name is "class_07" or the like.
 
         Returns
         -------

@@ -36,7 +36,7 @@ class RefineSettings:
     Raises
     ------
     SettingsError
-        A value outside its range.
+        A value outside its range, or both `filter` and `carve`.
     """
 
     k: int = 50

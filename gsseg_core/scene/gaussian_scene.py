@@ -191,6 +191,8 @@ class GaussianScene:
         ------
         EmptySceneError
             Nothing is picked.
+        IndexError
+            The mask is of another length, or there is no such Gaussian.
         """
         picked = np.arange(len(self))[index].reshape(-1)
         if picked.size == 0:

@@ -77,7 +77,7 @@ class Connection:
         self.close()
 
     def close(self) -> None:
-        """Take the client away; the node goes on."""
+        """Take the client away; the node goes on. What is asked for afterwards raises `RuntimeError`."""
         self._spinner.close()
 
     def wait_until_active(self, timeout: float = 120.0) -> None:

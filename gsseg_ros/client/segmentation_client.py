@@ -105,6 +105,8 @@ class SegmentationClient(SceneRequests):
         ------
         SegmentationError
             Among others BUSY where another job is running, and CANCELED after `cancel`; then nothing has been learnt.
+        ValueError
+            A number of views or steps is below 0.
         """
         for name, count in (("num_views", num_views), ("max_steps", max_steps)):
             if not 0 <= count < 2**32:
