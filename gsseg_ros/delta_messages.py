@@ -38,10 +38,10 @@ def delta_from_message(message: SceneDeltaMessage) -> SceneDelta:
 def message_from_delta(delta: SceneDelta) -> SceneDeltaMessage:
     """Write a change of a scene; its header is left to the caller."""
     message = SceneDeltaMessage(
-        revision=delta.revision or 0,
+        revision=int(delta.revision or 0),
         moves=[
             GroupMoveMessage(
-                group=move.group,
+                group=int(move.group),
                 motion=transform_of(move.motion.rotation, move.motion.translation),
                 scale=move.motion.scale,
                 views=list(move.views),

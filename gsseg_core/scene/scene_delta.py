@@ -102,7 +102,7 @@ class SceneDelta:
             ordered = np.sort(numbers)
             if name != "added_groups" and len(doubled := ordered[1:][ordered[1:] == ordered[:-1]]):
                 raise SceneDeltaError(f"scene delta: {name} hold {doubled[0]} twice; expected every id once")
-        if not isinstance(self.revision, int | None):
+        if not isinstance(self.revision, int | np.integer | None):
             raise SceneDeltaError(f"scene delta: revision is {clipped(self.revision)}; expected a whole number")
         for move in self.moves:
             if not 0 <= move.group <= MAX_ID:

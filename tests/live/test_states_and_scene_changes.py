@@ -49,6 +49,12 @@ def test_a_state_saved_before_changes_loads_after_them_as_if_its_views_had_been_
     np.testing.assert_array_equal(votes(again), votes(changing))
 
 
+def test_a_state_of_views_whose_group_is_a_number_of_numpy_can_be_saved(tmp_path: Path) -> None:
+    session(group=np.int64(0)).save(tmp_path / "state.npz")  # type: ignore[arg-type]
+    again = LivingSession(SCENE, NAMES)
+    assert again.load(tmp_path / "state.npz") == 4 and {view.group for view in again.views} == {0}
+
+
 def test_a_state_of_another_scene_whose_geometry_nobody_has_is_refused(tmp_path: Path) -> None:
     session().save(tmp_path / "state.npz")
     other = LivingSession(SCENE.subset(np.arange(500)), NAMES)

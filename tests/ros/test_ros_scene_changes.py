@@ -106,6 +106,12 @@ def test_a_request_and_the_topic_change_the_scene_and_votes_are_those_of_the_vie
     assert here.done("segment").report.num_gaussians == len(session.scene)
 
 
+def test_a_change_with_numbers_of_numpy_can_be_sent() -> None:
+    move = GroupMove(np.int64(3), Similarity())  # type: ignore[arg-type]
+    message = message_from_delta(SceneDelta(np.int64(4), moves=(move,)))  # type: ignore[arg-type]
+    assert (message.revision, message.moves[0].group) == (4, 3)
+
+
 def test_a_keyframe_whose_mask_still_waits_for_its_pose_is_fused_before_the_change_that_names_it(
     here: NodeHere, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -56,6 +56,13 @@ def test_a_change_comes_back_as_it_was_saved(saved: Path) -> None:
     assert empty.revision is None and empty.added is None and not empty.moves
 
 
+def test_a_change_with_numbers_of_numpy_can_be_saved(tmp_path: Path) -> None:
+    move = GroupMove(np.int64(3), Similarity(np.float32(1.5)))  # type: ignore[arg-type]
+    SceneDelta(np.int64(4), moves=(move,)).save(tmp_path / "delta.npz")  # type: ignore[arg-type]
+    again = SceneDelta.load(tmp_path / "delta.npz")
+    assert (again.revision, again.moves[0].group, again.moves[0].motion.scale) == (4, 3, 1.5)
+
+
 @pytest.mark.parametrize("share", [0.0, 0.1, 0.5, 0.9, 0.999])
 def test_a_truncated_file_is_refused_with_one_error(saved: Path, share: float) -> None:
     content = saved.read_bytes()
