@@ -23,6 +23,7 @@ from gsseg_core.raster.backends import make_operator
 from gsseg_core.raster.view_operator import ViewOperator
 from gsseg_core.raster.vote_total import VoteTotal
 from gsseg_core.scene.camera import Camera
+from gsseg_core.scene.gaussian_scene import GaussianScene
 from gsseg_core.segmentation import Segmentation
 from gsseg_core.spatial.row_order import along_curve
 
@@ -40,6 +41,11 @@ class PerViewSession(LiveSession):
 
     _LABEL, _REMEDY, _PER_VIEW = "would show the first of object", "", True
     _with_tree: tuple[Segmentation, Segmentation] | None = None  # a result, and the same with its tree
+
+    def __init__(self, scene: GaussianScene, class_names: None = None, **settings: Any) -> None:
+        if class_names is not None:
+            raise SettingsError("class_names are given; expected none: objects that are found have their own")
+        super().__init__(scene, None, **settings)
 
     @property
     def class_names(self) -> dict[int, str]:

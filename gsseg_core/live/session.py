@@ -73,8 +73,8 @@ class LiveSession:
         max_views: int = 200, device: str = "cpu", max_classes: int = 256,
     ) -> None:  # fmt: skip
         for name, value in (("max_views", max_views), ("max_classes", max_classes)):
-            if value < 1:
-                raise SettingsError(f"{name} is {value}; expected at least 1")
+            if not isinstance(value, int | np.integer) or value < 1:
+                raise SettingsError(f"{name} is {value}; expected at least 1, a whole number")
         self.scene, self.max_views, self.device = scene, max_views, device
         self.rejected: Counter[str] = Counter()
         self._classes = SessionClasses(class_names, max_classes)

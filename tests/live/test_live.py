@@ -138,8 +138,9 @@ def test_only_the_last_views_are_kept_and_no_vote_is_dropped() -> None:
     np.testing.assert_array_equal(session.codes(), fed(LiveSession(SCENE, NAMES)).codes())
     expected = taught(EMLearner(SCENE, NUM_CLASSES), VIEWS[-2:]).fit().codes_
     np.testing.assert_array_equal(session.learn().learnt.codes.dense(NUM_CLASSES), expected)
-    with pytest.raises(SettingsError, match="max_views is 0; expected at least 1"):
-        LiveSession(SCENE, NAMES, max_views=0)
+    for count in (0, 2.5):
+        with pytest.raises(SettingsError, match=f"max_views is {count}; expected at least 1, a whole number"):
+            LiveSession(SCENE, NAMES, max_views=count)  # type: ignore[arg-type]
 
 
 def test_a_view_of_a_name_that_is_kept_takes_its_place_and_all_counts_agree(tmp_path: Path) -> None:

@@ -373,3 +373,8 @@ def test_a_result_can_be_cut_at_a_level_and_the_tree_grows_with_the_views() -> N
     np.testing.assert_array_equal(np.isin(fine.labels, parts), objects.labels == whole)
     with pytest.raises(SettingsError, match="granularity"):
         session.at_level(objects, 2.0)
+
+
+def test_names_of_classes_are_refused_as_the_objects_have_their_own() -> None:
+    with pytest.raises(SettingsError, match="class_names are given; expected none"):
+        PerViewSession(SCENE, {1: "mug"})  # type: ignore[arg-type]
