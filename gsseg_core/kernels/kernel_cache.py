@@ -10,7 +10,9 @@ import os
 import pickle
 import sys
 import tempfile
+from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 _PACKAGE = Path(__file__).resolve().parents[1]
 
@@ -18,6 +20,11 @@ NOT_WHOLE = (EOFError, pickle.UnpicklingError)
 """What reading raises of a file that was not on the disk when the power failed: for ever, unless it is flushed."""
 
 REMEDY = "set NUMBA_CACHE_DIR to a folder that you can write to"
+
+
+if os.environ.get("XDG_CACHE_HOME") == "":
+    # Not set, says its specification; numba would load kernels from the folder in which the user happens to be.
+    del os.environ["XDG_CACHE_HOME"]
 
 
 def candidates() -> list[str]:
@@ -41,3 +48,16 @@ def writable(folder: str) -> bool:
 
 FOLDER: str | None = next(filter(writable, candidates()), None)
 """The folder that numba will take; None where it can write to none, so that each run compiles anew."""
+
+
+def keep(kernel: Any, enable: Callable[[Any], None]) -> None:
+    """Have a kernel kept from one run to the next, by what enables that of its kind, if it can be.
+
+    In the folder numba makes one for each of ours. Where root has run gsseg as this user, that may be root's.
+    """
+    global FOLDER
+    if FOLDER is not None:
+        try:
+            enable(kernel)
+        except RuntimeError:
+            FOLDER = None

@@ -20,7 +20,7 @@ from numba.core.environment import Environment, lookup_environment
 from numba.core.runtime.nrt import rtsys
 from numba.np.ufunc.parallel import _launch_threads
 
-from gsseg_core.kernels.kernel_cache import NOT_WHOLE
+from gsseg_core.kernels import kernel_cache
 from gsseg_core.kernels.parts import taken_for
 from gsseg_core.kernels.stamps import stamp_of
 
@@ -110,8 +110,11 @@ class _KernelCache(FunctionCache):
         _launch_threads()
         try:
             return self._load_overload(sig, target_context)
-        except (AttributeError, ImportError, *NOT_WHOLE):  # Or it was compiled for a type that has gone since.
-            self.flush()
+        except OSError:  # Somebody else's, who lets nobody read it.
+            return None
+        except (AttributeError, ImportError, *kernel_cache.NOT_WHOLE):  # Or compiled for a type that has gone since.
+            with suppress(OSError):
+                self.flush()
             return None
 
     def save_overload(self, sig: Any, data: Any) -> None:
@@ -120,5 +123,9 @@ class _KernelCache(FunctionCache):
 
 
 def keep(kernel: Dispatcher[Any]) -> None:
-    """Keep what is compiled of a kernel from one run to the next."""
+    """Keep what is compiled of a kernel from one run to the next, if that can be."""
+    kernel_cache.keep(kernel, _enable)
+
+
+def _enable(kernel: Dispatcher[Any]) -> None:
     kernel._cache = _KernelCache(kernel.py_func)  # type: ignore[attr-defined]

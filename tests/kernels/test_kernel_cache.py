@@ -82,6 +82,30 @@ def test_every_kernel_loads_and_runs_where_none_can_be_kept(nowhere: dict[str, s
     assert list((tmp_path / "cache").rglob("*.nbi"))
 
 
+def test_kernels_run_where_folders_or_files_of_the_cache_are_somebody_elses(
+    nowhere: dict[str, str], tmp_path: Path
+) -> None:
+    environment = {**nowhere, "NUMBA_CACHE_DIR": str(tmp_path / "cache")}
+    assert run(environment, "-c", ONE_KERNEL).stdout == "[0] 0\n"
+    (kept,) = (tmp_path / "cache").rglob("kernel.*connected_pixels*.nbi")
+    kept.unlink()
+    kept.mkdir()  # Root may read any file, but none that is a folder; nor write into a file.
+    done = run(environment, "-c", ONE_KERNEL)
+    assert done.stdout == "[0] 0\n", done.stderr
+    shutil.rmtree(kept.parent)
+    kept.parent.touch()
+    done = run(environment, "-c", ONE_KERNEL)
+    assert done.stdout == "[0] 0\n", done.stderr
+
+
+def test_no_kernel_is_loaded_from_the_folder_in_which_the_user_happens_to_be(tmp_path: Path) -> None:
+    environment = {**os.environ, "HOME": str(tmp_path), "XDG_CACHE_HOME": ""}
+    ours = "from gsseg_core.kernels import kernel_cache as k; print(k.candidates()[-1])"
+    numbas = "from numba.misc.appdirs import AppDirs; print(AppDirs(appname='numba', appauthor=False).user_cache_dir)"
+    done = run(environment, "-c", f"{ours}; {numbas}")
+    assert done.stdout == 2 * f"{tmp_path}/.cache/numba\n", done.stderr
+
+
 def test_a_kernel_that_is_not_whole_on_the_disk_is_compiled_anew_and_kept(tmp_path: Path) -> None:
     environment = {**os.environ, "NUMBA_CACHE_DIR": str(tmp_path)}
     assert run(environment, "-c", ONE_KERNEL).stdout == "[0] 0\n"
@@ -100,7 +124,13 @@ def test_a_kernel_of_the_gpu_that_is_not_whole_on_the_disk_is_compiled_anew(tmp_
 
 
 def test_a_disk_too_full_to_keep_a_kernel_does_not_end_the_run(tmp_path: Path) -> None:
-    done = run({**os.environ, "NUMBA_CACHE_DIR": str(tmp_path)}, "-c", FULL_DISK + ONE_KERNEL)
+    environment = {**os.environ, "NUMBA_CACHE_DIR": str(tmp_path)}
+    done = run(environment, "-c", FULL_DISK + ONE_KERNEL)
+    assert done.stdout == "[0] 0\n", done.stderr
+    assert run(environment, "-c", ONE_KERNEL).stdout == "[0] 0\n"
+    (kept,) = tmp_path.rglob("kernel.*connected_pixels*.nbc")
+    kept.write_bytes(b"")
+    done = run(environment, "-c", FULL_DISK + ONE_KERNEL)
     assert done.stdout == "[0] 0\n", done.stderr
 
 
