@@ -141,7 +141,7 @@ def gaussian_counts(result: Segmentation) -> dict[str, int]:
         "labelled": int((result.labels >= 0).sum()),
         "unobserved": int((result.labels == UNOBSERVED).sum()),
         "removed": int((result.labels == REMOVED).sum()),
-        "from_neighbours": int(result.clustered.sum()),
+        "from_neighbours": int((result.clustered & (result.labels >= 0)).sum()),  # of those that are labelled
     }
 
 

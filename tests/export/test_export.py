@@ -17,12 +17,13 @@ from gsseg_core.errors import PathTakenError, WriteError
 from gsseg_core.export import class_files as export
 from gsseg_core.export.class_files import class_file_name, export_classes
 from gsseg_core.export.pictures import legend, palette, save_png
+from gsseg_core.export.summary import gaussian_counts
 from gsseg_core.export.view_pictures import draw_views, view_file_name, write_overview, write_pictures
 from gsseg_core.files.json_files import write_json
 from gsseg_core.files.run_folder import RUN_FILE
 from gsseg_core.refine.settings import PAPER, RefineSettings
 from gsseg_core.scene.gaussian_scene import GaussianScene
-from gsseg_core.segmentation import Segmentation
+from gsseg_core.segmentation import REMOVED, Segmentation
 
 SCENE, TRUTH = balls_on_a_table()
 CODES = np.eye(NUM_CLASSES, dtype=np.float32)[TRUTH]
@@ -174,6 +175,14 @@ def test_the_legend_of_a_vocabulary_has_the_classes_that_are_there(tmp_path: Pat
     write_pictures(many, [], tmp_path)
     with Image.open(tmp_path / "legend.png") as image:
         np.testing.assert_array_equal(np.asarray(image), legend(shown, palette(20_000), many.counts()))
+
+
+def test_gaussians_labelled_by_their_neighbours_are_among_those_labelled() -> None:
+    some = replace(RESULT, clustered=np.arange(len(SCENE)) % 2 == 0)
+    removed = some.labels == REMOVED
+    counts = gaussian_counts(some)
+    assert (some.clustered & removed).any() and counts["removed"] == removed.sum()
+    assert counts["from_neighbours"] == (some.clustered & (some.labels >= 0)).sum()
 
 
 def test_a_report_that_cannot_be_written_leaves_the_earlier_one(tmp_path: Path) -> None:
