@@ -266,5 +266,6 @@ def render(
             write_mask(run.folder / name, ids[labels], bits, run.id)
             overlays.append(shrunk(image, CELL_PX))  # As the contact sheet has it; of all views, memory is for no more.
             save(run.folder / pictures[name], image)
-        write_overview(numbered, overlays, [view.name for view in views], run.folder / "overlays", save)
+        captions = [view.name for view in views]
+        write_overview(numbered, overlays, captions, run.folder / "overlays", save, ids.tolist())
     return [Path(out) / name for name in names]

@@ -124,13 +124,21 @@ def contact_sheet(images: Sequence[np.ndarray], captions: Sequence[str], columns
     return np.asarray(sheet)
 
 
-def legend(class_names: Mapping[int, str], colors: np.ndarray, counts: np.ndarray) -> np.ndarray:
+def legend(
+    class_names: Mapping[int, str],
+    colors: np.ndarray,  # (K, 3) uint8
+    counts: np.ndarray,  # (K,) of each class, such as the number of Gaussians
+    ids: Sequence[int] | None = None,  # (K,) by which files know the classes, if not by the numbers in `class_names`
+) -> np.ndarray:
     """Draw one line a class, in the order given, in as many columns of even length as it takes.
 
-    It has the class's colour of (K, 3) uint8, label, name, and count of (K,), such as the number of Gaussians.
+    It has the class's colour, id, name, and count.
     """
     margin, line, font = 16, 26, ImageFont.load_default(15)
-    entries = [(str(k), _shorten(name, font, 260), f"{counts[k]:,}") for k, name in class_names.items()]
+    entries = [
+        (str(k if ids is None else ids[k]), _shorten(name, font, 260), f"{counts[k]:,}")
+        for k, name in class_names.items()
+    ]
     id_width, name_width, count_width = (
         max((font.getlength(entry[i]) for entry in entries), default=0) for i in range(3)
     )

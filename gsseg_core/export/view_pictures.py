@@ -100,11 +100,15 @@ def look_and_draw(
 
 
 def write_pictures(
-    segmentation: Segmentation, drawn: Iterable[Drawn], folder: Path, save: SavePicture = save_png
+    segmentation: Segmentation,
+    drawn: Iterable[Drawn],
+    folder: Path,
+    save: SavePicture = save_png,
+    ids: Sequence[int] | None = None,
 ) -> list[Path]:
     """Write overlays of some views, as `draw_views` gives them, a contact sheet of them, and the legend.
 
-    Their files are `overlay_<stem>.png` ..., `contact_sheet.png` and `legend.png`.
+    Their files are `overlay_<stem>.png` ..., `contact_sheet.png` and `legend.png`; `ids` are those of `write_overview`.
     """
     images, captions, paths = [], [], []
     for one in drawn:
@@ -112,7 +116,7 @@ def write_pictures(
         captions.append(one.view.name)
         paths.append(folder / view_file_name(one.view.name, "overlay_"))
         save(paths[-1], one.overlay)
-    return paths + write_overview(segmentation, images, captions, folder, save)
+    return paths + write_overview(segmentation, images, captions, folder, save, ids)
 
 
 def write_overview(
@@ -121,6 +125,7 @@ def write_overview(
     captions: Sequence[str],
     folder: Path,
     save: SavePicture,
+    ids: Sequence[int] | None = None,  # of its classes, (K,), where these are numbered without the gaps of their ids
 ) -> list[Path]:
     """Write `contact_sheet.png` of some pictures, if there are any, and `legend.png`.
 
@@ -135,7 +140,7 @@ def write_overview(
     names, counts = result.class_names, result.counts()
     if len(names) > LEGEND_CLASSES:
         names = {k: name for k, name in names.items() if counts[k]}
-    save(paths[-1], legend(names, palette(result.num_classes), counts))
+    save(paths[-1], legend(names, palette(result.num_classes), counts, ids))
     return paths
 
 

@@ -113,7 +113,7 @@ def _picture(
     save = partial(behind, save_png, run=run.id)
     if level is not result:  # What is compared with the masks are objects, as they are.
         shown = draw_views(inputs.scene, level, inputs.pictured, device=images.device)
-    pictures = write_pictures(level, shown, folder, save)
+    pictures = write_pictures(level, shown, folder, save, inputs.class_ids)
     if assessment.checks:
         pictures.append(folder / "worst_views.png")
         save(pictures[-1], draw_worst_views(images.rendered, views, assessment.checks, device=images.device))

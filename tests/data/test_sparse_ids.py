@@ -19,6 +19,7 @@ from gsseg_core.csr_rows import CSRRows
 from gsseg_core.data.dataset import Dataset
 from gsseg_core.data.label_images import read_mask, write_mask
 from gsseg_core.errors import UnknownLabelError
+from gsseg_core.export.pictures import legend, palette
 from gsseg_core.learn.registry import make_learner
 from gsseg_core.raster.backends import make_operator
 from gsseg_core.scene.gaussian_scene import GaussianScene
@@ -88,6 +89,16 @@ def test_rendered_masks_hold_the_users_ids(runs: Path) -> None:
         assert (dense.bits, gaps.bits) == (8, 16)
         overlays = [Image.open(runs / name / "rendered/overlays" / path.name) for name in ("dense", "gaps")]
         np.testing.assert_array_equal(*overlays)
+
+
+def test_legends_show_the_users_ids_beside_the_same_colours(runs: Path) -> None:
+    result = Segmentation.load(runs / "dense/out/segmentation.npz", SCENE)
+    folder = runs / "gaps"
+    pipeline.render(folder / "scene.ply", folder, folder / "out/segmentation.npz", folder / "drawn", split="all")
+    expected = legend(result.class_names, palette(NUM_CLASSES), result.counts(), IDS.tolist())
+    for path in (folder / "out/pictures/legend.png", folder / "drawn/overlays/legend.png"):
+        with Image.open(path) as image:
+            np.testing.assert_array_equal(np.asarray(image), expected)
 
 
 def test_a_loaded_segmentation_speaks_of_the_users_ids(runs: Path) -> None:
