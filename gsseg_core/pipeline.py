@@ -81,7 +81,8 @@ def segment(
     )  # fmt: skip
     watch = Stopwatch()
     settings.check()
-    with staged_run(out, "segment", places=settings.places({}, []), inputs=folders_of(data, labels)) as run:
+    inputs_read = (scene_path, *folders_of(data, labels))
+    with staged_run(out, "segment", places=settings.places({}, []), inputs=inputs_read) as run:
         with ExitStack() as workers:
             with watch.stage("load"):
                 client = _connect(scheduler, workers)

@@ -71,7 +71,7 @@ def run(options: argparse.Namespace) -> int:
     posed = placed(options, scene, dataset, align=options.align).dataset
     cameras = {camera.name: camera for camera in posed.cameras}
     places = file, "object.obj", "pick.npz", "pick.png", "next.png"
-    with staged_run(out, "pick", places=places, inputs=folders_of(dataset.root)) as run:
+    with staged_run(out, "pick", places=places, inputs=(options.scene, *folders_of(dataset.root))) as run:
         picked = _picked(options, scene, cameras, dataset)
         _write(options, scene, picked, cameras[options.views[0]], run.folder / file, run.id)
         unseen = spread([camera for name, camera in cameras.items() if name not in options.views], CANDIDATES)

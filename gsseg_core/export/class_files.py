@@ -63,7 +63,8 @@ def export_classes(
     SceneValueError
         The format cannot hold the scene.
     PathTakenError
-        The folder, or the name of a file, is taken by what is no earlier export; nothing was written.
+        The folder, or the name of a file, is taken by what is no earlier export, or the scene is a file of that, which
+        would be lost; nothing was written.
     WriteError
         Something cannot be written; an earlier export is unchanged.
     """
@@ -71,7 +72,7 @@ def export_classes(
     check_collision(collision)
     segmentation.require(scene)
     folder = Path(folder)
-    with staged_run(folder, "classes") as run:
+    with staged_run(folder, "classes", inputs=filter(None, [scene.path])) as run:
         meshes = collision_meshes(scene, segmentation.labels, segmentation.confidence, collision)
         written = write_classes(scene, segmentation, run.folder, run.id, scene_format, meshes)
     return {k: folder / path.name for k, path in written.items()}

@@ -52,13 +52,13 @@ def staged_run(
     """Yield a run whose files, at the end of the body, become the result of their kind in `out`: all or none.
 
     The folder is made if it is not there; results of other kinds in it stay. `places`, the files that the run will
-    write, as far as they are known, are checked by `StagedRun.claim` at once, and that no folder of `inputs` is `out`.
+    write, as far as they are known, are checked by `StagedRun.claim` at once, and `inputs` by `keep_apart`.
 
     Raises `PathTakenError` where `out`, or a place in it, is taken by what is not gsseg's, and `WriteError` where
     something cannot be written; what was there before is then unchanged, unless the message says otherwise.
     """
     run = StagedRun(Path(out), kind)
-    there = [folder for folder in inputs if os.path.exists(folder)]  # before the run makes one
+    there = [path for path in inputs if os.path.exists(path)]  # before the run makes one
     try:
         run.begin()
         run.claim(places)
@@ -122,11 +122,18 @@ class StagedRun:
             _check_free(self.out, place, manifest, self._kind)
 
     def keep_apart(self, inputs: Iterable[str | os.PathLike[str]]) -> None:
-        """Raise `PathTakenError` if one of the folders that the run reads from is the one that it writes to."""
-        if any(os.path.samefile(self.out, folder) for folder in inputs):
-            raise PathTakenError(
-                f"{self.out}: gsseg {self._kind} reads from this folder; expected one for results alone"
-            )
+        """Raise `PathTakenError` if what the run reads is the folder that it writes to, or goes with its last run."""
+        gone = {os.path.realpath(self.out / place) for place in Manifest.read(self.out / RUN_FILE).files(self._kind)}
+        for path in filter(os.path.exists, inputs):
+            if os.path.samefile(self.out, path):
+                raise PathTakenError(
+                    f"{self.out}: gsseg {self._kind} reads from this folder; expected one for results alone"
+                )
+            if (file := os.path.realpath(path)) in gone:
+                raise PathTakenError(
+                    f"{file}: is read by gsseg {self._kind}, which would replace it with all other results in "
+                    f"{self.out}; expected another folder for the new ones"
+                )
 
     def commit(self) -> None:
         """Make what was written the result."""

@@ -200,6 +200,28 @@ def test_too_little_memory_is_one_clear_line_and_the_results_of_before_stay(
     assert stderr.count("\n") == 1 and contents(place) == before
 
 
+def test_segment_never_replaces_the_scene_that_it_reads(place: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    before = contents(place)
+    scene, (_, _, *others) = place / "out/classes/1_red_ball.ply", command(place)
+    (place / "link.ply").symlink_to(scene)
+    for path in (scene, place / "link.ply"):
+        assert main(["segment", str(path), *others]) == 2
+        assert_one_line(capsys.readouterr().err, f"{scene}: is read by gsseg segment, which would replace it with")
+    (place / "link.ply").unlink()
+    assert contents(place) == before
+    assert main(["segment", str(scene), *others[:-6], "--out", f"{place}/ball", *others[-4:]]) == 0
+
+
+def test_pick_never_replaces_the_scene_that_it_reads(place: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    dataset = ["--data", f"{place}/data", "--out", f"{place}/picked", "--quiet"]
+    shows = ["--view", "view0", "--mask", f"{place}/data/labels/view0.png", "--label", "1"]
+    assert main(["pick", f"{place}/data/scene.ply", *dataset, *shows]) == 0
+    before = contents(place)
+    assert main(["pick", f"{place}/picked/object.ply", *dataset, *shows]) == 2
+    assert "picked/object.ply: is read by gsseg pick, which would replace it" in capsys.readouterr().err
+    assert contents(place) == before
+
+
 def test_render_never_writes_over_the_masks(place: Path, capsys: pytest.CaptureFixture[str]) -> None:
     before = contents(place / "data")
     assert main([*command(place, "render"), "--out", f"{place}/data/labels"]) == 2

@@ -39,6 +39,15 @@ def contents(folder: Path) -> dict[str, bytes]:
     return {path.name: path.read_bytes() for path in folder.iterdir()}
 
 
+def test_an_export_never_replaces_the_scene_that_it_is_of(tmp_path: Path) -> None:
+    path = export_classes(SCENE, RESULT, tmp_path)[1]
+    before, ball = contents(tmp_path), GaussianScene.load(path)
+    of_ball = Segmentation.from_codes(ball, np.eye(NUM_CLASSES, dtype=np.float32)[ball.vertices["label"]], NAMES)
+    with pytest.raises(PathTakenError, match=r"1_red_ball\.ply: is read by gsseg classes, which would replace it"):
+        export_classes(ball, of_ball, tmp_path)
+    assert contents(tmp_path) == before
+
+
 def visible(folder: Path) -> list[Path]:
     return [path for path in folder.iterdir() if path.name != RUN_FILE]
 
