@@ -72,7 +72,11 @@ def labels_path(data: str, labels: str) -> str:
     """Return the place of the masks: in the dataset, or else, where that lacks it, as a shell completes it."""
     is_elsewhere = not os.path.exists(os.path.join(data, labels)) and os.path.exists(labels)
     # The default is a folder of the dataset only: masks that lie here by chance were not asked for.
-    return os.path.abspath(labels) if is_elsewhere and labels != LABELS else labels
+    if not is_elsewhere or labels == LABELS:
+        return labels
+    place, root = Path(os.path.abspath(labels)), os.path.abspath(data)
+    # What lies in the dataset moves with it, and reports are read after that, too.
+    return str(place.relative_to(root) if place.is_relative_to(root) else place)
 
 
 @contextmanager

@@ -23,6 +23,7 @@ from gsseg_core.cli.main import main
 from gsseg_core.files.run_folder import COMMIT_FILE, RUN_FILE
 from gsseg_core.scene.gaussian_scene import GaussianScene
 from gsseg_core.segmentation import Segmentation
+from gsseg_core.viewer.learnt_views import LearntFrom
 
 
 def command(place: Path, name: str = "segment") -> list[str]:
@@ -220,6 +221,17 @@ def test_pick_never_replaces_the_scene_that_it_reads(place: Path, capsys: pytest
     assert main(["pick", f"{place}/picked/object.ply", *dataset, *shows]) == 2
     assert "picked/object.ply: is read by gsseg pick, which would replace it" in capsys.readouterr().err
     assert contents(place) == before
+
+
+def test_masks_that_were_named_from_elsewhere_are_found_once_their_dataset_has_moved(
+    place: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (place / "data/labels").rename(place / "data/sam")
+    monkeypatch.chdir(place)
+    assert main([*command(place), "--labels", "data/sam"]) == 0
+    (place / "data").rename(place / "moved")
+    learnt = LearntFrom.read(place / "out/report.json")
+    assert learnt.labels == "sam" and learnt.views(learnt.dataset(f"{place}/moved"))
 
 
 def test_render_never_writes_over_the_masks(place: Path, capsys: pytest.CaptureFixture[str]) -> None:
