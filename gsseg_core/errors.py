@@ -135,4 +135,7 @@ def explained(error: BaseException) -> str | None:
     """Say what one of our errors says, or that memory is not enough; None of an error that nobody foresaw."""
     if isinstance(error, GssegError):
         return str(error)
-    return f"memory is not enough ({error})" if memory_ran_out(error) else None
+    if not memory_ran_out(error):
+        return None
+    said = f" ({error})" if str(error) else ""  # Python's own says nothing.
+    return f"memory is not enough{said}"

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from gsseg_core.errors import memory_ran_out
+from gsseg_core.errors import explained, memory_ran_out
 
 
 @pytest.mark.parametrize(
@@ -21,3 +21,9 @@ from gsseg_core.errors import memory_ran_out
 )
 def test_whether_memory_ran_out_is_told_by_the_error(error: Exception, ran_out: bool) -> None:
     assert memory_ran_out(error) == ran_out
+
+
+def test_an_error_of_memory_without_a_text_has_no_empty_brackets() -> None:
+    assert explained(MemoryError()) == "memory is not enough"
+    assert explained(MemoryError("for 1 GiB")) == "memory is not enough (for 1 GiB)"
+    assert explained(ValueError("memory")) is None

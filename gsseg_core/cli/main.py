@@ -25,7 +25,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     if arguments is None:
         interrupts.leave_at_once()
     from gsseg_core.cli import terminal
-    from gsseg_core.errors import GssegError, memory_ran_out
+    from gsseg_core.errors import GssegError, explained
 
     terminal.prepare()
     try:
@@ -40,12 +40,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
     except Exception as error:
         if interrupts.was_raised():
             return interrupts.EXIT_CODE
-        if memory_ran_out(error):
-            terminal.note(f"error: memory is not enough ({error}); expected smaller views, or a smaller scene")
-            return 2
-        if not isinstance(error, GssegError):
+        if (what := explained(error)) is None:
             raise
-        terminal.note(f"error: {error}")
+        hint = "" if isinstance(error, GssegError) else "; expected smaller views, or a smaller scene"
+        terminal.note(f"error: {what}{hint}")
         return 2
 
 

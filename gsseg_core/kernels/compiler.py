@@ -20,10 +20,10 @@ F = TypeVar("F", bound=Callable[..., object])
 
 _njit: Any = numba.njit  # Its types know fewer options than it takes.
 _LESS: dict[str, Any] = {}
-_keep: Callable[[Dispatcher[Any]], None] = Dispatcher.enable_caching
+_enable: Callable[[Dispatcher[Any]], None] = Dispatcher.enable_caching
 # Versions that were not tried compile and load in numba's own way, which takes longer.
 if numba.__version__.startswith("0.68."):
-    from gsseg_core.kernels.loading import keep as _keep
+    from gsseg_core.kernels.loading import enable as _enable
     from gsseg_core.kernels.parts import KernelCompiler
 
     _LESS = {"no_cfunc_wrapper": True, "pipeline_class": KernelCompiler}
@@ -43,8 +43,8 @@ def kernel(function: Callable[..., object] | None = None, **options: Any) -> Any
         return partial(kernel, **options)
     made = _njit(function, nogil=True, **_LESS, **options)
     # With NUMBA_DISABLE_JIT it is the function itself.
-    if kernel_cache.FOLDER is not None and isinstance(made, Dispatcher):
-        _keep(made)
+    if isinstance(made, Dispatcher):
+        kernel_cache.keep(made, _enable)
     return made
 
 

@@ -122,10 +122,6 @@ class _KernelCache(FunctionCache):
             super().save_overload(sig, data)
 
 
-def keep(kernel: Dispatcher[Any]) -> None:
-    """Keep what is compiled of a kernel from one run to the next, if that can be."""
-    kernel_cache.keep(kernel, _enable)
-
-
-def _enable(kernel: Dispatcher[Any]) -> None:
+def enable(kernel: Dispatcher[Any]) -> None:
+    """Keep what is compiled of a kernel from one run to the next."""
     kernel._cache = _KernelCache(kernel.py_func)  # type: ignore[attr-defined]

@@ -29,15 +29,18 @@ if not SIMULATED:
     # A small image starts few blocks, which nobody needs to be warned of.
     cuda.dispatcher.config.CUDA_LOW_OCCUPANCY_WARNINGS = 0
 
-_KEPT = kernel_cache.FOLDER is not None and not SIMULATED
-
 
 def gpu_kernel(function: Callable[..., Any]) -> Any:
     """Compile a kernel for the GPU, to be started by `launch`, and keep it from one run to the next if that can be."""
-    made = cuda.jit(function, fastmath=True, cache=_KEPT)
-    if _KEPT:
-        made._cache.load_overload = functools.partial(_whole, made._cache, made._cache.load_overload)
+    made = cuda.jit(function, fastmath=True)
+    if not SIMULATED:
+        kernel_cache.keep(made, _enable)
     return made
+
+
+def _enable(kernel: Any) -> None:
+    kernel.enable_caching()
+    kernel._cache.load_overload = functools.partial(_whole, kernel._cache, kernel._cache.load_overload)
 
 
 def _whole(cache: Any, load: Callable[..., Any], *of_kernel: Any) -> Any:
