@@ -79,13 +79,15 @@ def require_own_folder(out: Path, kind: str) -> None:
 
 
 @contextlib.contextmanager
-def staged_export(folder: Path, within: Path) -> Iterator[StagedRun]:
+def staged_export(folder: Path, within: Path, scene: Path | None = None) -> Iterator[StagedRun]:
     """Give a run whose files become the export in a folder below `within`, which must hold nothing but exports.
+
+    The file of the scene must be none of an earlier export there, which goes.
 
     Raises `PathNotAllowedError`, `PathTakenError`, `WriteError`: as `pinned_folder`, `require_own_folder` and
     `gsseg_core.files.run_folder.staged_run` do.
     """
     with pinned_folder(folder, within) as pinned:
         require_own_folder(pinned, "segment")
-        with staged_run(pinned, "segment") as run:
+        with staged_run(pinned, "segment", inputs=filter(None, [scene])) as run:
             yield run

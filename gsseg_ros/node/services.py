@@ -298,7 +298,8 @@ class Services:
             self.workspace.number(run)
             session = selection.session
             result = selection.result.selected(selection.chosen, selection.min_confidence)
-            with run.watch.stage("write"), staged_export(directory, self.workspace.root) as staged:
+            export = staged_export(directory, self.workspace.root, selection.scene.path)
+            with run.watch.stage("write"), export as staged:
                 result.save(staged.folder / "segmentation.npz", staged.id)
                 meshes = collision_meshes(selection.scene, result.labels, result.confidence, collision)
                 classes = staged.folder / "classes"

@@ -99,6 +99,20 @@ def test_a_first_export_that_was_killed_within_its_move_is_finished_by_the_next(
     assert (killed / "report.json").read_text() == "second"
 
 
+def test_a_scene_that_is_a_file_of_an_earlier_export_is_not_replaced_by_the_next(tmp_path: Path) -> None:
+    with staged_export(tmp_path / "new", tmp_path) as run:
+        (run.folder / "cup.ply").write_text("a cup")
+    scene = tmp_path / "new" / "cup.ply"
+    with (
+        pytest.raises(PathTakenError, match=f"{scene}: is read .* all other results in {tmp_path}/new; expected"),
+        staged_export(tmp_path / "new", tmp_path, scene),
+    ):
+        pytest.fail("nothing is to be written")
+    assert scene.read_text() == "a cup"
+    with staged_export(tmp_path / "other", tmp_path, scene) as run:
+        (run.folder / "cup.ply").write_text("another")
+
+
 def test_a_folder_whose_name_is_too_long_for_the_disk_is_one_clear_error(tmp_path: Path) -> None:
     with pytest.raises(WriteError, match="name too long"):
         require_own_folder(tmp_path / ("x" * 300), "segment")
