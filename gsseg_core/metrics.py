@@ -191,7 +191,8 @@ def evaluate_folders(pred_dir: str | Path, truth_dir: str | Path, cameras: Itera
     """Compare every `<stem>.png` in one folder of label images with the mask of the same view in another.
 
     Truth without a prediction is ignored, since a folder of true masks holds the train views too. With `cameras`, truth
-    is read as masks to learn from are: undistorted where a lens bent the image, and scaled to its size.
+    of another size than its prediction's is read as masks to learn from are: undistorted where a lens bent the image,
+    and scaled to its size.
 
     Raises `NoUsableViewsError` where there is no PNG in `pred_dir`, `MaskFormatError` where a prediction has no truth
     or a file is no label image, and `MaskSizeError` where a prediction and its truth differ in size.
@@ -211,9 +212,13 @@ def evaluate_folders(pred_dir: str | Path, truth_dir: str | Path, cameras: Itera
         )
     evaluation = Evaluation()
     for path, image in zip(predictions, images, strict=True):
-        is_known, truth = path.stem in known, truths[image]
-        labels = View(known[path.stem], truth).read_labels() if is_known else read_mask(truth).labels
-        evaluation.add(labels, read_mask(path).labels, name=str(path))
+        prediction, camera, truth = read_mask(path).labels, known.get(path.stem), truths[image]
+        view = None if camera is None else View(camera, truth)
+        if view is None or (view.camera.undistortion is None and view.mask_size == prediction.shape[::-1]):
+            labels = read_mask(truth).labels
+        else:
+            labels = view.read_labels()
+        evaluation.add(labels, prediction, name=str(path))
     return evaluation
 
 

@@ -191,6 +191,17 @@ def test_truth_is_found_and_scaled_as_masks_to_learn_from_are(tmp_path: Path, na
     np.testing.assert_array_equal(found.confusion, np.eye(24))
 
 
+def test_a_prediction_of_the_size_of_its_truth_is_scored_as_it_is_whatever_the_size_of_the_camera(
+    tmp_path: Path,
+) -> None:
+    labels = np.arange(24).reshape(4, 6)
+    for folder in ("pred", "truth"):
+        write_mask(tmp_path / folder / "a.png", labels, bits=8)
+    camera = Camera("a", 12, 8, np.array([[9.0, 0, 6], [0, 9, 4], [0, 0, 1]]), np.eye(4))
+    found = evaluate_folders(tmp_path / "pred", tmp_path / "truth", [camera])
+    np.testing.assert_array_equal(found.confusion, np.eye(24))
+
+
 def test_folders_that_cannot_be_compared_are_refused_with_one_clear_error(tmp_path: Path) -> None:
     pred, truth = tmp_path / "pred", tmp_path / "truth"
     with pytest.raises(NoUsableViewsError, match="pred: found no predictions"):
