@@ -169,6 +169,13 @@ def test_a_large_object_is_judged_by_a_sample() -> None:
     np.testing.assert_allclose(box_around(points).size, SIZE, rtol=0.01)
 
 
+def test_the_box_of_an_object_of_thousands_does_not_depend_on_the_order_of_its_gaussians() -> None:
+    rng = np.random.default_rng(1)
+    points = rng.normal(size=(7_900, 3)) * SIZE @ rotation(2).T
+    shuffled = points[rng.permutation(len(points))]
+    np.testing.assert_allclose(box_around(shuffled).size, box_around(points).size, rtol=1e-9)
+
+
 @pytest.fixture(scope="module")
 def segmented() -> tuple[GaussianScene, Segmentation]:
     scene, _ = balls_on_a_table()
