@@ -63,8 +63,8 @@ def camera_hint(folder: Path) -> str:
             if found := known.find_in(below):
                 # ns-process-data writes cameras into a sub-folder, and masks lie here: a link puts the two together.
                 # Where there is a folder sparse/ already, with sparse/1 in it, a link of this name would go into it.
-                free = [name for name in known.folders[::-1] if not (folder / name).is_dir()]
-                place = folder / next(iter([*free, found.name]))
+                free = (name for name in reversed(known.folders) if not (folder / name).is_dir())
+                place = folder / next(free, found.name)
                 return f"; found cameras in {found}: type ln -s {_quoted(found.resolve())} {_quoted(place)}"
     for name, advice in _FOREIGN_CAMERAS.items():
         if (folder / name).is_file():

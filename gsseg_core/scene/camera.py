@@ -132,13 +132,17 @@ class Camera:
 
     def checked_pixel(self, row: int | None, column: int | None) -> tuple[int, int]:
         """Return row and column, or raise `SettingsError` unless that is a pixel of the view."""
-        whole = isinstance(row, int | np.integer) and isinstance(column, int | np.integer)
-        if row is None or column is None or not (whole and 0 <= row < self.height and 0 <= column < self.width):
-            raise SettingsError(
-                f"view '{self.name}': pixel is (row {row}, column {column}); expected a row from 0 to "
-                f"{self.height - 1} and a column from 0 to {self.width - 1}, whole numbers"
-            )
-        return row, column
+        if (
+            isinstance(row, int | np.integer)
+            and isinstance(column, int | np.integer)
+            and 0 <= row < self.height
+            and 0 <= column < self.width
+        ):
+            return row, column
+        raise SettingsError(
+            f"view '{self.name}': pixel is (row {row}, column {column}); expected a row from 0 to "
+            f"{self.height - 1} and a column from 0 to {self.width - 1}, whole numbers"
+        )
 
     @property
     def _who(self) -> str:

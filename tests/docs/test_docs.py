@@ -22,14 +22,14 @@ import numpy as np
 import pytest
 from doc_blocks import FENCE, FIRST, PAGES, REPOSITORY, Block, blocks_of, needs_ros
 from doc_commands import Started, check, core_libraries, kind_of, run_commands, setup_py, words_of
+from missing_ros import MISSING
 
 from gsseg_core.cli.arguments import COMMANDS, command_module
 from gsseg_core.data.dataset import Dataset
 
 MOST_NOT_RUN = 7
-HAS_ROS = all(map(importlib.util.find_spec, ("rclpy", "gsseg_msgs")))
 PROGRAMS = {
-    "gsseg": "gsseg_core.cli", **(importlib.import_module("gsseg_ros.child_nodes").NODES if HAS_ROS else {}),
+    "gsseg": "gsseg_core.cli", **({} if MISSING else importlib.import_module("gsseg_ros.child_nodes").NODES),
     "dask": "dask", "python": "", "python3": "",
 }  # fmt: skip
 MASKS = "docs/masks.md"

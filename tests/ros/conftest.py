@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
-from importlib.util import find_spec
 from pathlib import Path
 
 import pytest
+from missing_ros import MISSING
 
 
 def pytest_pycollect_makemodule(module_path: Path, parent: pytest.Collector) -> pytest.Module:
@@ -18,7 +18,6 @@ class RosModule(pytest.Module):
         try:
             return super().collect()
         except self.CollectError as error:
-            missing = [name for name in ("rclpy", "gsseg_msgs") if find_spec(name) is None]
-            if not missing or not isinstance(error.__cause__, ModuleNotFoundError):
+            if not MISSING or not isinstance(error.__cause__, ModuleNotFoundError):
                 raise
-            pytest.skip(f"{' and '.join(missing)} not installed", allow_module_level=True)
+            pytest.skip(f"{' and '.join(MISSING)} not installed", allow_module_level=True)

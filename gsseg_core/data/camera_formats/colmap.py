@@ -141,7 +141,7 @@ def _copy_images_of_text(source: BinaryIO, target: BinaryIO) -> None:
         if (image := line.strip()) and not image.startswith(b"#"):
             *pose, name = image.split(None, 9)
             points = next(source, b"\n")  # pycolmap forgets an image without this line
-            if (last := points.rsplit(None, 1)[-1:]) and not re.fullmatch(rb"[-+.0-9eE]+", last[0].strip()):
+            if (last := points.rsplit(None, 1)[-1:]) and not re.fullmatch(rb"[-+.0-9eE]+", last[0]):
                 image_name, found = (quoted(text[:60].decode(errors="replace")) for text in (name, points))
                 raise UnfitError(
                     f"after image {image_name} comes {found}; expected its points, or an empty line if there are none"

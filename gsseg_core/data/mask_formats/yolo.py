@@ -54,7 +54,7 @@ def read_yolo(place: Place) -> MaskSet:
     return MaskSet(views, {0: BACKGROUND_NAME, **{c + 1: name for c, name in sorted(names.items())}})
 
 
-def _are_tracked(place: Path, texts: Iterable[str]) -> bool:
+def _are_tracked(folder: Path, texts: Iterable[str]) -> bool:
     """Whether lines end with a confidence and the id of a track, which together look like a point.
 
     An id above 1 is no share of an image. Raises `MaskFormatError` where a track of the id 1 is all that there may be.
@@ -65,7 +65,7 @@ def _are_tracked(place: Path, texts: Iterable[str]) -> bool:
     if len(every) > 1 and set(every) == {1} and max(map(len, ids)) == 1:
         found = quoted(" ".join(next(filter(None, lines))[0].split()[-2:]))
         raise MaskFormatError(
-            f"{place}: lines end with {found} and the like, which may be a point, or a confidence and the id of a "
+            f"{folder}: lines end with {found} and the like, which may be a point, or a confidence and the id of a "
             "track; expected no confidences (save_conf=False of Ultralytics)"
         )
     return max(every, default=0) > 1

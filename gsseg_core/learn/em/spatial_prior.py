@@ -17,10 +17,14 @@ from gsseg_core.spatial.neighbourhood import neighbour_weights, neighbours_of
 
 
 def spatial_prior(
-    shares: CSRRows, evidence: np.ndarray,  # N rows of votes from 0, or probabilities; (N,) px by which each was seen
-    scene: GaussianScene, k: int, weight: float, num_classes: int,
-) -> CSRRows:  # fmt: skip
-    """Mean probabilities of the k nearest Gaussians, by how well each was seen, times `weight`; empty if none was."""
+    shares: CSRRows,  # N rows of each class, in any unit: votes of at least 0, or probabilities
+    evidence: np.ndarray,  # (N,): by how many px each was seen, 0 where it was not
+    scene: GaussianScene,
+    k: int,
+    weight: float,
+    num_classes: int,
+) -> CSRRows:
+    """Mean probabilities of the k nearest Gaussians, better seen ones the more, times a weight; empty if none was."""
     neighbours = neighbours_of(scene, k) if weight else None
     if neighbours is None:
         return CSRRows.empty(shares.num_rows, np.float32)
