@@ -116,7 +116,7 @@ for drawn in (region(camera, state.label_map(camera), *middle, 1), looks_alike(s
 state.set_level(0.85)
 state.change(lambda model: setattr(model, "min_probability", 0.5))
 state.seen()[0].nodes
-assert pick(scene, camera.center, scene.means[0] - camera.center, state.model.shown())
+assert pick(scene, camera, camera.center, scene.means[0] - camera.center, state.model.shown())
 state.view_votes()
 state.segmentation_npz()
 state.selection("ply")""",

@@ -10,10 +10,10 @@ import numpy as np
 from gsseg_core.data.view import View
 from gsseg_core.progress import Progress, silent, with_progress
 from gsseg_core.raster.backends import make_operator
-from gsseg_core.scene.camera import Camera, pose_looking
+from gsseg_core.scene.camera import Camera, rigid_motion
 from gsseg_core.scene.gaussian_scene import GaussianScene
 
-_WINDOW = 3  # px, each way, of the picture whose middle is the ray
+_WINDOW = 65  # px, each way, of the part of a picture whose middle is the ray
 
 
 class Picked(NamedTuple):
@@ -25,22 +25,27 @@ class Picked(NamedTuple):
 
 def pick(
     scene: GaussianScene,
+    camera: Camera,  # of the picture that was clicked; it may have moved since
     origin: np.ndarray,  # (3,): of the ray, in the world
     direction: np.ndarray,  # (3,): of any length but zero
     shown: np.ndarray | None = None,  # (N,) bool: look through all others
     *,
-    focal: float = 1000.0,  # of the image that was clicked, in px: Gaussians are widened by a third of one of these
     device: str = "cpu",
 ) -> Picked | None:
-    """Follow a ray into the scene, to the Gaussian that makes most of what is seen there; None where it meets nothing.
+    """Follow a ray of a picture into the scene, to the Gaussian that makes most of what is seen there; None if nothing.
 
-    The ray is the middle of a camera of a few pixels, so that a Gaussian counts by the weight with which it is drawn,
-    and one that is hidden by others does not count.
+    A Gaussian counts by the weight with which the picture draws it, and one that is hidden by others does not count. So
+    what is rendered is a part of that picture and not one that looks along the ray: seen from another angle, Gaussians
+    have other depths, and another order.
     """
-    forward = np.asarray(direction, np.float64) / np.linalg.norm(direction)
-    pose = pose_looking(forward, np.eye(3)[np.argmin(np.abs(forward))], np.asarray(origin, np.float64))
-    K = np.array([[focal, 0, _WINDOW / 2], [0, focal, _WINDOW / 2], [0, 0, 1]])
-    operator = make_operator(scene, Camera("click", _WINDOW, _WINDOW, K, pose), device)
+    rotation = camera.world_to_camera[:3, :3]
+    x, y, z = (rotation @ np.asarray(direction, np.float64)).tolist()
+    if z <= 0:
+        return None
+    middle = _WINDOW / 2
+    K = np.array([[camera.fx, 0, middle - camera.fx * x / z], [0, camera.fy, middle - camera.fy * y / z], [0, 0, 1]])
+    part = Camera("click", _WINDOW, _WINDOW, K, rigid_motion(rotation, -rotation @ np.asarray(origin, np.float64)))
+    operator = make_operator(scene, part, device)
     if shown is not None:
         operator = operator.without(~shown)
     weights = operator.weights(_WINDOW // 2, _WINDOW // 2)

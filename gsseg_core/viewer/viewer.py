@@ -82,10 +82,10 @@ class Viewer:
         with self.panel.answer.telling(event.client):
             picked = pick(
                 state.model.scene,
+                camera_of(event.client),
                 np.array(event.ray_origin),
                 np.array(event.ray_direction),
                 state.model.shown(),
-                focal=camera_of(event.client).fy,
                 device=state.device,
             )
             self.panel.answer.show_picked(asked, picked)

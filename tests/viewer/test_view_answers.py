@@ -16,6 +16,8 @@ from small_scenes import NAMES, balls_on_a_table, clean_views, ring, write_datas
 
 pytest.importorskip("viser")
 
+from viser.transforms import SO3
+
 from gsseg_core.data.dataset import Dataset
 from gsseg_core.errors import MaskFormatError
 from gsseg_core.scene.camera import Camera
@@ -42,8 +44,9 @@ def viewer() -> Iterator[Viewer]:
 
 
 def viewed_from(camera: Camera) -> MagicMock:
-    """A browser that looks from there, wherever it looks to."""
-    seen = MagicMock(fov=1.0, aspect=1.0, image_height=480, position=camera.center, wxyz=np.eye(4)[0])
+    """A browser that looks from there."""
+    wxyz = SO3.from_matrix(camera.world_to_camera[:3, :3].T).wxyz
+    seen = MagicMock(fov=1.0, aspect=1.0, image_height=480, position=camera.center, wxyz=wxyz)
     return MagicMock(camera=seen)
 
 
