@@ -43,7 +43,7 @@ class Voxels(NamedTuple):
 
     def cells(self, points: npt.NDArray[np.floating]) -> tuple[npt.NDArray[np.int64], ...]:
         """Find the voxels that points (..., 3) are in: their indices."""
-        found = ((points - self.low) / self.size).astype(np.int64) + self.margin
+        found = np.floor((points - self.low) / self.size).astype(np.int64) + self.margin
         return tuple(np.moveaxis(np.clip(found, 0, np.array(self.filled.shape) - 1), -1, 0))
 
     def mesh(self, solid: npt.NDArray[np.bool_], values: npt.NDArray[np.floating], level: float) -> TriangleMesh:

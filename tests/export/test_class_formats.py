@@ -19,6 +19,7 @@ from gsseg_core.errors import EmptySceneError, PathTakenError, SettingsError
 from gsseg_core.export import class_files
 from gsseg_core.export.class_files import class_file_name, export_classes, write_selection
 from gsseg_core.export.collision import HULL, KINDS, POISSON, SURFACE, collision_meshes
+from gsseg_core.export.poisson_surface import Voxels
 from gsseg_core.files.run_folder import RUN_FILE
 from gsseg_core.refine.settings import RefineSettings
 from gsseg_core.scene.gaussian_scene import GaussianScene
@@ -197,6 +198,14 @@ def test_a_poisson_surface_closes_a_box_without_a_bottom_and_leaves_a_bowl_hollo
         mesh = meshes_in(*shells(points, scale), POISSON)[1]
         closed = trimesh.Trimesh(mesh.points, mesh.triangles)
         assert closed.is_watertight and closed.body_count == 1 and closed.volume == pytest.approx(volume, rel=0.1)
+
+
+def test_a_point_is_in_the_voxel_around_it_below_the_lowest_ellipsoid_too() -> None:
+    voxels = Voxels(np.zeros((9, 9, 9), bool), np.float32([1, 2, 3]), 0.5, margin=4)
+    places = np.argwhere(~voxels.filled)
+    middles = voxels.low + (places - voxels.margin + 0.5) * voxels.size
+    for shift in (-0.2, 0.2):
+        np.testing.assert_array_equal(np.stack(voxels.cells(middles + shift), axis=1), places)
 
 
 def test_a_sheet_that_is_seen_from_both_sides_gets_the_surface_around_it() -> None:
