@@ -23,7 +23,6 @@ from gsseg_core.files.input_files import READABLE_IMAGES
 
 # Camera files of other programs, and how one gets from each to one that is read.
 _FOREIGN_CAMERAS = {
-    "transforms_train.json": "its cameras are nerfstudio's: copy it to transforms.json, with the image size as w and h",
     "poses_bounds.npy": "it is LLFF's: run nerfstudio's ns-process-data, or COLMAP, on the photos",
     "cameras.xml": "it is Metashape's: run nerfstudio's ns-process-data metashape on it",
     "sfm_data.json": "it is OpenMVG's: run openMVG_main_openMVG2Colmap -i sfm_data.json -o sparse",

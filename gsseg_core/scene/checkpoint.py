@@ -15,7 +15,7 @@ import numpy.typing as npt
 from gsseg_core.files.input_files import OPENED, UnfitError
 from gsseg_core.scene.scene_file import open_scene, size_of
 from gsseg_core.scene.spherical_harmonics import MAX_DEGREE
-from gsseg_core.scene.vertices import ReadScene, dc_of, pack_vertices
+from gsseg_core.scene.vertices import SH_LEFT_OUT, ReadScene, dc_of, pack_vertices
 from gsseg_core.text import quoted
 
 _EXPECTED = "a checkpoint of gsplat or nerfstudio's splatfacto"
@@ -41,7 +41,7 @@ def read_checkpoint(path: Path, within: Path | None = None) -> ReadScene:
         arrays = {name: _array(tensors, name, size) for name in ("means", "scales", "quats", "opacities")}
         dc, rest = (_array(tensors, names[part], size) for part in ("dc", "rest"))
         vertices = _vertices(arrays, dc, rest, names is _SPLATFACTO)
-    remarks = ("SH above degree 3 are left out",) if rest.ndim == 3 and rest.shape[1] > 15 else ()
+    remarks = (SH_LEFT_OUT,) if rest.ndim == 3 and rest.shape[1] > 15 else ()
     return ReadScene(vertices, "gsplat" if names is _GSPLAT else "splatfacto", remarks)
 
 

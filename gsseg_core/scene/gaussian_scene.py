@@ -76,8 +76,8 @@ class GaussianScene:
     def load(cls, path: str | os.PathLike[str], within: Path | None = None) -> GaussianScene:
         """Load a scene of any of `gsseg_core.scene.scene_formats.SCENE_FORMATS`; Gaussian i is record i of the file.
 
-        A 3DGS PLY has SH degree 0 to 3, is ascii or binary, float or double, with properties in any order. With
-        `within`, the file must lie below that folder, links followed.
+        A 3DGS PLY has SH degree 0 to 4, of which those above 3 are left out, is ascii or binary, float or double, with
+        properties in any order. With `within`, the file must lie below that folder, links followed.
 
         Raises
         ------

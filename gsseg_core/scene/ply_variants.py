@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Collection
 from pathlib import Path
 
 import numpy as np
@@ -9,17 +10,36 @@ import numpy.typing as npt
 
 from gsseg_core.errors import SceneValueError
 from gsseg_core.scene.ply import is_ply, read_vertices
-from gsseg_core.scene.vertices import DC, OPACITY, SCALES, ReadScene, check_properties, columns, dc_of
+from gsseg_core.scene.vertices import (
+    DC,
+    OPACITY,
+    REST_COUNTS,
+    SCALES,
+    SH_LEFT_OUT,
+    ReadScene,
+    check_properties,
+    columns,
+    dc_of,
+    rest_names,
+)
 
 _RGB = ("red", "green", "blue")
 _FILTER = "filter_3D"
+_DEGREE_4 = rest_names(3 * (5**2 - 1))
 _FLATNESS = float(np.log(1e-3))  # Thin enough to be a disc, and thick enough for float32.
 
 
 def read_3dgs(path: Path, within: Path | None = None) -> ReadScene:
-    """Read a 3DGS PLY; one with colours as bytes instead of SH, as nerfstudio exports it if asked to, counts as one."""
+    """Read a 3DGS PLY; one with colours as bytes instead of SH, as nerfstudio exports it if asked to, counts as one.
+
+    Of SH of degree 4, which some trainers learn, those up to degree 3 are read.
+    """
     vertices = read_vertices(path, within)
     names = vertices.dtype.names or ()
+    if set(_DEGREE_4).issubset(names):
+        kept = np.arange(len(_DEGREE_4)).reshape(3, -1)[:, : REST_COUNTS[-1] // 3].ravel()  # All of red comes first.
+        moved = {name: vertices[_DEGREE_4[i]] for name, i in zip(rest_names(REST_COUNTS[-1]), kept, strict=True)}
+        return ReadScene(_with(vertices, moved, set(_DEGREE_4) - set(moved)), "", (SH_LEFT_OUT,))
     if DC[0] in names or OPACITY[0] not in names or not set(_RGB).issubset(names):
         return ReadScene(vertices)
     dc = dc_of(columns(vertices, _RGB) / 255)
@@ -51,7 +71,7 @@ def read_mip_splatting(path: Path, within: Path | None = None) -> ReadScene:
     # Where nothing is smoothed, the logit of an opacity near 1 stays as exact as it was.
     logit = np.where(size[:, 0] > 0, logit, vertices[OPACITY[0]])
     changed = {**dict(zip(SCALES, grown.T, strict=True)), OPACITY[0]: logit}
-    return ReadScene(_with(vertices, changed, without=_FILTER), "", ("filter_3D is fused into scales and opacities",))
+    return ReadScene(_with(vertices, changed, without={_FILTER}), "", ("filter_3D is fused into scales and opacities",))
 
 
 def is_2dgs(head: bytes) -> bool:
@@ -79,10 +99,10 @@ def _properties(head: bytes) -> set[bytes]:
 def _with(
     vertices: npt.NDArray[np.void],  # (N,)
     changed: dict[str, npt.NDArray[np.floating]],  # (N,)
-    without: str = "",
+    without: Collection[str] = (),
 ) -> npt.NDArray[np.void]:
-    """Copy vertices with properties replaced or added as float32, and one left out."""
-    kept = [(name, vertices.dtype[name]) for name in vertices.dtype.names or () if name != without]
+    """Copy vertices with properties replaced or added as float32, and some left out."""
+    kept = [(name, vertices.dtype[name]) for name in vertices.dtype.names or () if name not in without]
     added = [(name, np.dtype(np.float32)) for name in changed if name not in (vertices.dtype.names or ())]
     out = np.empty(len(vertices), [*kept, *added])
     for name in out.dtype.names or ():

@@ -40,7 +40,7 @@ class SceneFormat:
 
 
 SCENE_FORMATS = [
-    SceneFormat("3DGS PLY", ply_variants.read_3dgs, (".ply",), "everything, as written by trainers"),
+    SceneFormat("3DGS PLY", ply_variants.read_3dgs, (".ply",), "everything, but SH up to degree 3"),
     SceneFormat(
         "PlayCanvas compressed PLY", compressed_ply.read_compressed_ply, (".compressed.ply",),
         "SH degree 0 to 3 in 8 bits; positions and scales in 10 to 11 bits per block of 256, rotations in 10, colours "
@@ -80,8 +80,8 @@ SCENE_FORMATS = [
         "everything, as floats or as normalised integers", gltf.is_gltf,
     ),
     SceneFormat(
-        "gsplat or nerfstudio checkpoint", checkpoint.read_checkpoint, (".pt", ".ckpt"), "everything",
-        checkpoint.is_checkpoint,
+        "gsplat or nerfstudio checkpoint", checkpoint.read_checkpoint, (".pt", ".ckpt"),
+        "everything, but SH up to degree 3", checkpoint.is_checkpoint,
     ),
 ]  # fmt: skip
 """All formats, the first for a file that is of no known one; a new one is added here."""

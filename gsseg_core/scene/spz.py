@@ -19,7 +19,7 @@ from gsseg_core.scene.moving import move
 from gsseg_core.scene.quaternions import from_smallest_three
 from gsseg_core.scene.scene_file import check_count, check_size, open_scene
 from gsseg_core.scene.spherical_harmonics import MAX_DEGREE
-from gsseg_core.scene.vertices import ReadScene, logits, pack_in_blocks, pack_vertices
+from gsseg_core.scene.vertices import SH_LEFT_OUT, ReadScene, logits, pack_in_blocks, pack_vertices
 
 _MAGIC = b"NGSP"
 _GZIP = b"\x1f\x8b\x08"  # deflated, as all are
@@ -94,7 +94,7 @@ def decode_spz(file: Any, path: Path) -> ReadScene:
 
     vertices = pack_in_blocks(count, pack)
     next(readers, None)
-    remarks = [f"SH above degree {MAX_DEGREE} are left out"] if header.degree > MAX_DEGREE else []
+    remarks = [SH_LEFT_OUT] if header.degree > MAX_DEGREE else []
     if header.flags & _ANTIALIASED:
         remarks.append("trained with antialiasing, which is left out")
     if system != "RUB":

@@ -21,6 +21,7 @@ QUATS = ("rot_0", "rot_1", "rot_2", "rot_3")
 BLOCK = 1 << 15  # Gaussians that are packed or unpacked at a time
 REST_COUNTS = tuple(3 * (d + 1) ** 2 - 3 for d in range(spherical_harmonics.MAX_DEGREE + 1))
 """How many properties f_rest_* a scene of SH degree 0, 1, 2, 3 has."""
+SH_LEFT_OUT = f"SH above degree {spherical_harmonics.MAX_DEGREE} are left out"  # a remark
 
 _MARGIN = 1e-7  # Opacities are kept so far from 0 and 1, where the logit is infinite.
 _LEAST_SCALE = float(np.exp(-40))  # What half floats and bytes round to nothing is no more than this.

@@ -161,10 +161,10 @@ def test_doctor_says_of_a_folder_without_cameras_what_lies_there_and_where_a_sce
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     (tmp_path / "capture").mkdir()
-    (tmp_path / "capture/transforms_train.json").touch()
+    (tmp_path / "capture/poses_bounds.npy").touch()
     assert main(["doctor", str(tmp_path / "capture")]) == 2
     told = capsys.readouterr().err
-    assert "has no cameras; looked for cameras.json" in told and "found transforms_train.json" in told
+    assert "has no cameras; looked for cameras.json" in told and "found poses_bounds.npy" in told
     assert told.endswith("; no scene lies in it\n")
     write_dataset(tmp_path / "trained")
     (tmp_path / "trained/cameras.json").unlink()

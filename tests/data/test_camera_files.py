@@ -23,7 +23,7 @@ from camera_folders import (
 from PIL import Image
 
 from gsseg_core.data.camera_files import read_cameras
-from gsseg_core.errors import CameraFileError, GssegError, IntrinsicsError, PoseError
+from gsseg_core.errors import CameraFileError, GssegError, IntrinsicsError, PathNotAllowedError, PoseError
 from gsseg_core.scene.gaussian_scene import GaussianScene
 
 
@@ -118,6 +118,23 @@ def test_the_last_row_of_a_nerfstudio_pose_may_be_rounded(tmp_path: Path) -> Non
     content["frames"][0]["transform_matrix"][3] = [0.0, 0.0, 1e-17, 1.0000000000000002]
     (tmp_path / "transforms.json").write_text(json.dumps(content))
     assert_lands(read_cameras(tmp_path)[0], 55, 35)
+
+
+@pytest.mark.parametrize(("file", "name"), [("0001.png", "./train/0001"), ("0001.jpg", "train/0001.jpg")])
+def test_where_no_size_is_given_the_images_are_asked(tmp_path: Path, file: str, name: str) -> None:
+    angle = 2 * math.atan(WIDTH / 2 / FX)
+    sizeless = dict.fromkeys(("fl_x", "fl_y", "cx", "cy", "w", "h"))
+    write_json(tmp_path / "transforms_train.json", transforms(name, camera_angle_x=angle, **sizeless))
+    assert_refused(tmp_path, IntrinsicsError, "entry 0: the image size is missing", f"train/{file}: cannot be read")
+    (tmp_path / "train").mkdir()
+    Image.new("RGBA" if file.endswith("png") else "RGB", (WIDTH, HEIGHT)).save(tmp_path / "train" / file)
+    (camera,) = read_cameras(tmp_path)
+    assert (camera.name, camera.image_size) == ("0001", (WIDTH, HEIGHT))
+    assert_lands(camera, 32 + 25, 24 + 12.5)
+    with pytest.raises(PathNotAllowedError, match=file):
+        (tmp_path / "train" / file).rename(tmp_path.parent / file)
+        (tmp_path / "train" / file).symlink_to(tmp_path.parent / file)
+        read_cameras(tmp_path, within=tmp_path)
 
 
 @pytest.mark.parametrize(

@@ -277,7 +277,6 @@ def test_a_colmap_model_in_the_folder_itself_is_linked_to_where_it_is_read(tmp_p
 @pytest.mark.parametrize(
     ("name", "told"),
     [
-        ("transforms_train.json", "copy it to transforms.json"),
         ("poses_bounds.npy", "LLFF"),
         ("database.db", "mapper"),
         ("mesh_info.json", "ns-process-data polycam"),

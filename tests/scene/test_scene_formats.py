@@ -315,6 +315,19 @@ def test_a_variant_of_ply_that_lacks_properties_is_refused_as_any_other(tmp_path
         GaussianScene.load(tmp_path / "a.ply")
 
 
+def test_of_a_ply_of_sh_degree_4_those_up_to_degree_3_are_read(tmp_path: Path) -> None:
+    zeros, sh = np.zeros((5, 3)), np.random.default_rng(1).normal(size=(5, 25, 3)).astype(np.float32)
+    vertices = pack_vertices(zeros, np.ones((5, 4)), zeros, np.zeros(5), sh[:, 0], sh[:, 1:])
+    with_labels = np.zeros(5, [*vertices.dtype.descr, ("label", "i4")])
+    for name in vertices.dtype.names or ():
+        with_labels[name] = vertices[name]
+    with_labels["label"] = np.arange(5)
+    scene = GaussianScene.load(write_ply(tmp_path / "a.ply", with_labels))
+    np.testing.assert_array_equal(scene.sh, sh[:, :16])
+    assert scene.vertices["label"].tolist() == [0, 1, 2, 3, 4] and (scene.opacities == 0.5).all()
+    assert read_scene(tmp_path / "a.ply").remarks == ("SH above degree 3 are left out",)
+
+
 def test_packed_vertices_are_laid_out_as_trainers_do() -> None:
     zeros = np.zeros((2, 3))
     rest = np.arange(18.0).reshape(2, 3, 3)

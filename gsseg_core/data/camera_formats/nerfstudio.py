@@ -1,4 +1,4 @@
-"""Cameras of nerfstudio: `transforms.json`."""
+"""Cameras of nerfstudio, instant-ngp and NeRF's synthetic scenes: `transforms.json`."""
 
 from __future__ import annotations
 
@@ -9,6 +9,7 @@ import numpy as np
 
 from gsseg_core.data.camera_formats.entries import Entry, Intrinsics, cameras_of, entries, inverse_pose
 from gsseg_core.errors import CameraFileError, IntrinsicsError, PoseError
+from gsseg_core.files.input_files import READABLE_IMAGES, open_image
 from gsseg_core.files.json_files import read_object
 from gsseg_core.scene.camera import RIGID_TOLERANCE, Camera
 from gsseg_core.scene.lens import LENS_MODELS, MODELS_BY_NAME, Projection
@@ -19,7 +20,10 @@ _COEFFICIENTS = sorted({name for model in LENS_MODELS for name in model.coeffici
 
 
 def read_nerfstudio(path: Path, within: Path | None) -> list[Camera]:
-    """Read `transforms.json`: camera-to-world poses in OpenGL axes (y up, z backward), intrinsics per file or frame."""
+    """Read `transforms.json`: camera-to-world poses in OpenGL axes (y up, z backward), intrinsics per file or frame.
+
+    Where it does not say how large the images are, as those of NeRF's synthetic scenes do not, these are asked.
+    """
     content = read_object(path, CameraFileError, "an object with 'frames'", within)
     shared = {key: value for key, value in content.items() if key != "frames"}
     cameras = []
@@ -30,6 +34,8 @@ def read_nerfstudio(path: Path, within: Path | None) -> list[Camera]:
         if matrix.shape == (4, 4) and not np.allclose(matrix[3], (0, 0, 0, 1), 0, RIGID_TOLERANCE):
             raise PoseError(f"{where}: the last row of the pose is {matrix[3].tolist()}; expected 0 0 0 1")
         pose = inverse_pose(matrix[:3, :3] * (1, -1, -1), matrix[:3, 3])
+        if "w" not in entry or "h" not in entry:
+            entry.fields.update(zip("wh", _size_of_image(path, entry, within), strict=True))
         cameras += cameras_of(where, name, _intrinsics(entry), pose)
     return cameras
 
@@ -43,8 +49,6 @@ def _intrinsics(entry: Entry) -> Intrinsics:
         raise IntrinsicsError(f"{where}: camera model is {clipped(name)}; expected {known}: undistort the images first")
     if model.projection is Projection.PERSPECTIVE and not model.rational:
         model = _BROWN
-    if "w" not in entry or "h" not in entry:
-        raise IntrinsicsError(f"{where}: the image size is missing; expected 'w' and 'h', here or for all frames")
     width, height = entry.size("w"), entry.size("h")
     if model.projection is Projection.PANORAMA:
         return Intrinsics(model, (width, height), (1.0, 1.0), (0.0, 0.0))
@@ -55,6 +59,18 @@ def _intrinsics(entry: Entry) -> Intrinsics:
     cy = entry.number("cy") if "cy" in entry else height / 2
     coefficients = {name: entry.number(name) for name in _COEFFICIENTS if name in entry}
     return Intrinsics(model, (width, height), (fx, fx if fy is None else fy), (cx, cy), coefficients)
+
+
+def _size_of_image(path: Path, entry: Entry, within: Path | None) -> tuple[int, int]:
+    """Ask the image of a frame for its width and height; PNG is its suffix where the file leaves that out."""
+    image = path.parent / entry.fields["file_path"]
+    image = image if image.suffix.lower() in READABLE_IMAGES else Path(f"{image}.png")
+    try:
+        with open_image(image, IntrinsicsError, "image", "a photo", within=within) as photo:
+            return photo.size
+    except IntrinsicsError as error:
+        expected = "'w' and 'h', here or for all frames, or an image that tells"
+        raise IntrinsicsError(f"{entry.where}: the image size is missing; expected {expected}: {error}") from None
 
 
 def _focal(entry: Entry, key: str, angle_key: str, size: int) -> float | None:

@@ -52,7 +52,9 @@ class CameraFormat:
 
 CAMERA_FORMATS = [
     CameraFormat("3DGS", read_3dgs, ("cameras.json",)),
-    CameraFormat("nerfstudio", read_nerfstudio, ("transforms.json",), frame_of_training=saved_to_trained),
+    CameraFormat(
+        "nerfstudio", read_nerfstudio, ("transforms.json", "transforms_train.json"), frame_of_training=saved_to_trained
+    ),
     CameraFormat("COLMAP", read_colmap, ("cameras.bin", "cameras.txt"), ("sparse/0", "sparse"), original_to_trained),
 ]
 """All formats; the first that a dataset has is read. A new one is added here."""
