@@ -62,7 +62,7 @@ class Learner(ABC):
     Attributes
     ----------
     views : dict of str to View
-        Views that count, by name, in the order in which they came.
+        Views that count, by name, in the order in which they came; with their masks as they were then, in memory.
     rejected : dict of str to str
         Names of views that could not be used, and why.
     code_rows_ : CSRRows
@@ -126,15 +126,14 @@ class Learner(ABC):
         MaskFormatError, MaskSizeError, UnknownLabelError
             The mask is broken, of another size than the camera, or has labels beyond the classes.
         """
-        if self.memory_budget == 0:
-            view = view.held()  # Nothing else tells which votes were its own, should its file have changed by then.
         if self.memory_budget == 0 and view.name not in self.views:
+            view = view.held()
             try:
                 sees = self._lift(view, read_usable_mask(view, self.num_classes), 1, operator)
             except UnusableViewError as why:
                 return self._add(view, why)
             return self._add(view, None if sees else UnusableViewError(SEES_NOTHING))
-        return self._add(view, self._opened(view, operator))
+        return self._add(*self._opened(view, operator))
 
     def observe_all(self, views: Sequence[View], progress: Progress = silent) -> None:
         """Add views, as `observe` does; the error that one of them raises ends it."""
@@ -143,7 +142,7 @@ class Learner(ABC):
                 self.observe(view)
             return
         with vote_total(self._votes, self.device) as total:
-            for view, opened in each_with_made(self._opened, views, self.device, progress, "observe"):
+            for _, (view, opened) in each_with_made(self._opened, views, self.device, progress, "observe"):
                 self._add(view, opened, total)
 
     def retract(self, name: str) -> None:
@@ -302,13 +301,17 @@ class Learner(ABC):
         used = self._used_labels(seen, operator)
         return operator.vote(used.labels, used.evidence, self._votes, sign=sign)
 
-    def _opened(self, view: View, operator: ViewOperator | None = None) -> Observation | UnusableViewError:
-        """Prepare a new view; return the error that says why, where it cannot be used."""
+    def _opened(self, view: View, operator: ViewOperator | None = None) -> tuple[View, Observation | UnusableViewError]:
+        """Prepare a new view; return the error that says why, where it cannot be used. First comes the view, held.
+
+        Should the file of its mask change, nothing else tells which votes were its own: to save, or to prepare it anew.
+        """
+        view = view.held()
         try:
             observation = self._prepare(view, read_usable_mask(view, self.num_classes), operator)
         except UnusableViewError as why:
-            return why
-        return observation if observation.num_pairs else UnusableViewError(SEES_NOTHING)
+            return view, why
+        return view, observation if observation.num_pairs else UnusableViewError(SEES_NOTHING)
 
     def _add(self, view: View, opened: Observation | UnusableViewError | None, total: Any = None) -> bool:
         """List a view, and add its votes, if it is prepared, to the `total` or else to the learner's; or reject it."""
@@ -327,8 +330,8 @@ class Learner(ABC):
             raise
         self.rejected.pop(view.name, None)
         self.views[view.name] = view
-        if opened is not None and not self._prepared.keep(view.name, opened):
-            self.views[view.name] = view.held()  # Else nothing tells which votes are its own, as with no budget.
+        if opened is not None:
+            self._prepared.keep(view.name, opened)
         return True
 
     def _of_each(

@@ -49,14 +49,14 @@ class PreparedViews:
         in_file = self._file.nbytes + self._answers.nbytes
         return sum(self._sizes.values()), in_file
 
-    def keep(self, name: str, observation: Observation) -> bool:
-        """Keep a view, where there is room; returns whether there was."""
+    def keep(self, name: str, observation: Observation) -> None:
+        """Keep a view, where there is room."""
         with _KEEPING:
             size = observation.nbytes
             if self.nbytes[0] + size <= self._budget:
                 self.in_memory[name], self._sizes[name] = observation, size
-                return True
-            return self._budget > 0 and self._with_file and self._file.put(name, observation)
+            elif self._budget > 0 and self._with_file:
+                self._file.put(name, observation)
 
     def get(self, name: str) -> Observation | None:
         """Return a view, if it is kept."""

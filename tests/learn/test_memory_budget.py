@@ -19,6 +19,8 @@ from gsseg_core.files import scratch_file
 from gsseg_core.learn import prepared_views
 from gsseg_core.learn.em.em_learner import EMLearner
 from gsseg_core.learn.gradient_learner import GradientLearner
+from gsseg_core.learn.learner import Learner
+from gsseg_core.learn.learner_state import State
 from gsseg_core.learn.mask_reliability import check_views
 from gsseg_core.learn.vote_learner import VoteLearner
 from gsseg_core.raster.cpu import label_pairs
@@ -125,6 +127,26 @@ def test_a_mask_that_was_corrected_in_its_file_replaces_what_the_file_held_befor
     np.testing.assert_array_equal(
         learner._votes.dense(), taught(VoteLearner(SCENE, NUM_CLASSES), VIEWS[:1])._votes.dense()
     )
+
+
+@every_learner
+@pytest.mark.parametrize("budget", [0, 1, 1 << 30])
+def test_what_is_saved_and_prepared_anew_are_the_masks_that_have_voted(
+    kind: type[Learner], budget: int, tmp_path: Path
+) -> None:
+    views = [View(view.camera, tmp_path / f"{view.name}.png") for view in VIEWS]
+    for view, known in zip(views, VIEWS, strict=True):
+        write_mask(view.source, known.read_labels(), 8)
+    learner, first = taught(kind(SCENE, NUM_CLASSES, memory_budget=budget), views), views[0]
+    for view in views:
+        write_mask(view.source, np.full((view.camera.height, view.camera.width), 3), 8)
+    learner.state().save(tmp_path / "state.npz", SCENE.digest)
+    learner.adopt(State.load(tmp_path / "state.npz", SCENE.digest, len(SCENE)))
+    expected = taught(kind(SCENE, NUM_CLASSES), VIEWS)
+    np.testing.assert_array_equal(learner.fit().codes_, expected.fit().codes_)
+    learner.retract(first.name)
+    expected.retract(first.name)
+    np.testing.assert_array_equal(learner._votes.dense(), expected._votes.dense())
 
 
 def test_a_negative_memory_budget_is_refused() -> None:

@@ -76,7 +76,7 @@ def prepare(
     shard._votes = VoteTotal(0, num_classes)
     with _all_threads():
         for view in views:
-            opened = shard._opened(view)
+            view, opened = shard._opened(view)
             if isinstance(opened, UnusableViewError):
                 shard.rejected[view.name] = str(opened)
             else:
