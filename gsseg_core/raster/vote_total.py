@@ -107,16 +107,17 @@ class VoteTotal:
 
     def resize(self, num_classes: int) -> None:
         """Have this many classes; votes for others are gone."""
-        table = self._table
+        table, pages, count = self._table, self._pages, self._count
         if num_classes > len(table):
             table = np.full((max(num_classes, len(table) * 5 // 4), table.shape[1]), _NONE, np.int32)
             table[: len(self._table)] = self._table
         if np.any(table[num_classes:] != _NONE):
             table = table[:num_classes].copy()
             kept = table != _NONE
-            self._pages, self._count = self._pages[table[kept]], int(np.count_nonzero(kept))
-            table[kept] = np.arange(self._count)
-        self._table, self.shape = table, (self.shape[0], num_classes)
+            pages, count = pages[table[kept]], int(np.count_nonzero(kept))
+            table[kept] = np.arange(count)
+        # At last: out of memory before, nothing has changed.
+        self._table, self._pages, self._count, self.shape = table, pages, count, (self.shape[0], num_classes)
 
     @contextmanager
     def _pages_whole(self) -> Iterator[None]:

@@ -177,7 +177,7 @@ def test_of_many_classes_neighbours_have_few_and_that_is_what_is_kept() -> None:
     assert found.nbytes == total.nbytes < VoteTotal.from_rows(anywhere, k).nbytes / 5
 
 
-def test_without_memory_for_pages_nothing_changes(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_without_memory_nothing_changes(monkeypatch: pytest.MonkeyPatch) -> None:
     rng = np.random.default_rng(0)
     first, second = cast(rng, 600, 3), cast(rng, 600, 7)
     total = VoteTotal(600, 7)
@@ -191,6 +191,11 @@ def test_without_memory_for_pages_nothing_changes(monkeypatch: pytest.MonkeyPatc
         patch.setattr(vote_total.np, "zeros", full)
         with pytest.raises(MemoryError):
             total.add(*second)
+    np.testing.assert_array_equal(total.dense(), before)
+    with monkeypatch.context() as patch:
+        patch.setattr(vote_total.np, "arange", full)  # the last array that fewer classes take
+        with pytest.raises(MemoryError):
+            total.resize(1)
     np.testing.assert_array_equal(total.dense(), before)
     total.add(*second)
     np.testing.assert_array_equal(total.dense(), before + dense_votes((600, 7), *second))
