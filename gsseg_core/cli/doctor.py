@@ -257,6 +257,11 @@ def _devices() -> Iterator[Finding]:
     except ImportError:
         yield Finding("devices", "cpu", f"{cores} cores")
     try:
+        os.getcwd()
+    except FileNotFoundError:  # PyTorch would end this process as it loads.
+        yield Finding("devices", "cuda", "not looked at: the current folder is gone", "-", "cd to one that is there")
+        return
+    try:
         import torch
 
         gpus = [torch.cuda.get_device_name(i) for i in range(torch.cuda.device_count())]

@@ -189,6 +189,13 @@ def test_doctor_reports_kernels_that_do_not_run(monkeypatch: pytest.MonkeyPatch)
     assert main(["doctor"]) == 2
 
 
+def test_doctor_works_in_a_folder_that_is_gone(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (tmp_path / "gone").mkdir()
+    monkeypatch.chdir(tmp_path / "gone")
+    (tmp_path / "gone").rmdir()
+    assert "cd to one that is there" in [finding.fix for finding in doctor._devices()]
+
+
 def test_doctor_looks_for_ros_without_importing_it() -> None:
     program = "import sys; from gsseg_core.cli.doctor import examine; examine(); sys.exit('rclpy' in sys.modules)"
     environment = {**os.environ, "PYTHONPATH": str(Path(doctor.__file__).parents[2])}
