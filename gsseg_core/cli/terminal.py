@@ -10,7 +10,7 @@ from collections.abc import Iterator
 from typing import TextIO
 
 from gsseg_core.errors import WriteError
-from gsseg_core.text import one_line
+from gsseg_core.text import one_line, printable
 
 
 def prepare() -> None:
@@ -27,13 +27,13 @@ def prepare() -> None:
 
 
 def tell(text: str) -> None:
-    """Print what a command has found.
+    """Print what a command has found, line by line as `printable` has it: paths are whatever their owner called them.
 
     Raises `WriteError` where standard output cannot be written, `BrokenPipeError` where its reader has left, as `head`
     does.
     """
     with _named():
-        print(text, flush=True)
+        print("\n".join(map(printable, text.split("\n"))), flush=True)
 
 
 def flush() -> None:

@@ -14,6 +14,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from gsseg_core.cli import terminal
 from gsseg_core.data.label_images import write_mask
 from gsseg_core.progress import progress_bars, with_progress
 from gsseg_core.text import counted, table
@@ -55,6 +56,11 @@ def test_a_name_that_the_terminal_cannot_show_is_escaped(scoring: list[str], tmp
     done = subprocess.run(scoring, capture_output=True, text=True, env=environment, check=False)
     assert (done.returncode, done.stderr) == (0, "")
     assert NAME.encode("ascii", "backslashreplace").decode() in done.stdout and (tmp_path / "s.json").is_file()
+
+
+def test_a_path_that_steers_the_terminal_is_printed_as_escapes(capsys: pytest.CaptureFixture[str]) -> None:
+    terminal.tell("Objects: \x1b[2Jout/classes\nLabels: 椅子 out")
+    assert capsys.readouterr().out == "Objects: \\x1b[2Jout/classes\nLabels: 椅子 out\n"
 
 
 @pytest.mark.parametrize("command", ["eval", "--help"])
