@@ -34,12 +34,12 @@ def main(arguments: Sequence[str] | None = None) -> int:
         finally:
             terminal.flush()
     except KeyboardInterrupt:
-        return interrupts.EXIT_CODE
+        return interrupts.exit_code()
     except BrokenPipeError:
         return 0  # The reader of our output has left, as `head` does; there is nobody to tell.
     except Exception as error:
         if interrupts.was_raised():
-            return interrupts.EXIT_CODE
+            return interrupts.exit_code()
         if (what := explained(error)) is None:
             raise
         hint = "" if isinstance(error, GssegError) else "; expected smaller views, or a smaller scene"

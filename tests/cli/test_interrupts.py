@@ -1,4 +1,4 @@
-"""Ctrl-C ends the program `gsseg` with exit code 130, in silence, whatever it is doing."""
+"""Ctrl-C ends the program `gsseg` with exit code 130, in silence, whatever it is doing; SIGTERM and SIGHUP likewise."""
 
 from __future__ import annotations
 
@@ -87,9 +87,12 @@ def test_an_interrupt_is_not_lost_and_not_printed_wherever_it_is_raised(work: st
     assert (done.returncode, done.stdout, done.stderr) == (code, "", "")
 
 
-def test_a_job_in_the_background_stays_deaf_to_what_is_typed() -> None:
-    program = "import signal; signal.signal(signal.SIGINT, signal.SIG_IGN)\n" + AT_WORK
-    done = run(program.replace("{work}", "    interrupt(); return 7"))
+@pytest.mark.parametrize("name", ["SIGINT", "SIGHUP"])
+def test_a_job_in_the_background_stays_deaf_to_what_is_typed_and_one_of_nohup_to_the_end_of_its_terminal(
+    name: str,
+) -> None:
+    program = f"import signal; signal.signal(signal.{name}, signal.SIG_IGN)\n" + AT_WORK
+    done = run(program.replace("{work}", f"    os.kill(os.getpid(), signal.{name}); return 7"))
     assert (done.returncode, done.stderr) == (7, "")
 
 
@@ -118,7 +121,10 @@ def test_an_interrupt_while_learning_ends_with_130_and_changes_nothing(
     assert contents(place / "out") == before
 
 
-def test_ctrl_c_in_a_real_process_ends_with_130_and_no_traceback(place: Path) -> None:
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
+def test_a_signal_in_a_real_process_ends_it_without_a_traceback_and_leaves_nothing_behind(
+    place: Path, number: signal.Signals
+) -> None:
     before = contents(place / "out")
     # The learner waits, so that the signal meets it at work; the warm-up, which tells nobody, goes on.
     program = (
@@ -137,8 +143,8 @@ def test_ctrl_c_in_a_real_process_ends_with_130_and_no_traceback(place: Path) ->
         stderr = b""
         while b"at work" not in stderr and process.poll() is None:
             stderr += os.read(process.stderr.fileno(), 4096)
-        process.send_signal(signal.SIGINT)
+        process.send_signal(number)
         stderr += process.stderr.read()
-    assert process.returncode == 130, stderr
+    assert process.returncode == 128 + number, stderr
     assert b"Traceback" not in stderr and b"gsseg" not in stderr and stderr.endswith(b"\n")
     assert contents(place / "out") == before
