@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -21,6 +22,7 @@ from gsseg_core.errors import (
 from gsseg_core.learn.em.em_learner import EMLearner
 from gsseg_core.live.current_codes import current_evidence
 from gsseg_core.live.session import LiveSession
+from gsseg_core.raster.backends import make_operator
 from gsseg_core.refine.settings import UNREFINED, RefineSettings
 from gsseg_core.segmentation import Segmentation
 
@@ -59,6 +61,28 @@ def test_after_learning_its_codes_hold_and_votes_speak_for_the_gaussians_that_it
     evidence = current_evidence(session._live, session.learnt)
     np.testing.assert_array_equal(evidence[known], session.learnt.evidence[known])
     np.testing.assert_array_equal(evidence[~known], session._live.evidence()[~known])
+
+
+def test_what_learning_left_unknown_stays_so_until_other_views_have_seen_as_much_of_it() -> None:
+    first, wrong = VIEWS[0].camera, VIEWS[0].read_labels()
+    wrong[wrong == 1] = 2
+    seen = make_operator(SCENE, first).adjoint(np.ones((*wrong.shape, 1), np.float32))[:, 0] * (TRUTH == 1)
+    hidden = np.zeros((len(SCENE), 1), np.float32)
+    hidden[np.argsort(-seen)[:4]] = 1
+    views = [View.from_arrays(first, wrong)]
+    for view in VIEWS[1:]:  # They contradict the first one, but say nothing where they see what is hidden.
+        labels = view.read_labels()
+        labels[make_operator(SCENE, view.camera).render(hidden)[..., 0] > 0] = UNKNOWN
+        views.append(View.from_arrays(view.camera, labels))
+    session = fed(LiveSession(SCENE, NAMES), views)
+    learnt = session.learn().learnt
+    rejected = (learnt.evidence > 10) & ~learnt.codes.known()
+    assert rejected.any()
+    np.testing.assert_array_equal(session.codes(), learnt.codes.dense(NUM_CLASSES))
+    refined = Segmentation.from_codes(SCENE, session.codes(), NAMES, evidence=learnt.evidence)
+    np.testing.assert_array_equal(session.segmentation(UNCARVED).labels, refined.labels)
+    fed(session, [replace(view, camera=replace(view.camera, name=f"{view.name} again")) for view in VIEWS])
+    assert (session.codes()[rejected].argmax(axis=1) == 1).all()
 
 
 def test_without_refinement_probabilities_are_calibrated_too_and_the_last_refined_result_stays_kept() -> None:
