@@ -223,7 +223,8 @@ class EMLearner(Learner):
     def predict_without(self, view: View) -> np.ndarray:
         """Blend into a view the probabilities of a last step without its mask, (H, W, K) float32.
 
-        The spatial prior is left out, too, so rows sum to less where no other view has seen anything.
+        The spatial prior is left out, too, so rows sum to less where no other view has seen anything. Of Gaussians that
+        no pixel of the mask lies on, which it says nothing of, the last step is not taken, and what they had stays.
         """
         codes, _, background, operator = self._without(view, only_labelled=False)
         return operator.blend_probabilities(codes, self.num_classes, background)
