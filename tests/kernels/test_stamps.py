@@ -5,7 +5,9 @@ from __future__ import annotations
 import shutil
 import subprocess
 import sys
+from collections.abc import Callable, Iterator
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -20,11 +22,46 @@ FILES = {
     "readers": "from made import formats\nFACTOR = 2\n\ndef read(file):\n    return formats.known(file)\n",
     "formats": "def known(file):\n    return True\n",
 }
-CALL = "from made.kernels import double; print(double(3), sum(double.stats.cache_hits.values()))"
+CALL = "from made.kernels import double; print(double(3), sum(double.stats.cache_hits.values()), flush=True)"
+
+# What takes a program most of its time is to import numba and to have it compile for the first time.
+PROGRAMS = """
+import os, sys
+import gsseg_core.kernels.compiler
+import numba
+numba.njit(lambda x: x)(1)
+sys.dont_write_bytecode = True
+for line in sys.stdin:
+    folder, call = line.rstrip().split(None, 1)
+    if (child := os.fork()) == 0:
+        sys.path.insert(0, folder)
+        exec(call)
+        os._exit(0)
+    if os.waitpid(child, 0)[1]:
+        print("failed", flush=True)
+"""
+
+Programs = Callable[..., str]
+
+
+@pytest.fixture(name="called_from", scope="module")
+def called_from_fixture() -> Iterator[Programs]:
+    """Call the kernel of a folder in a program of its own: what it returns, and how many kernels came from the cache.
+
+    These programs begin as copies of one that knows of no kernel yet.
+    """
+    pipes: dict[str, Any] = {"stdin": subprocess.PIPE, "stdout": subprocess.PIPE, "text": True}
+    with subprocess.Popen([sys.executable, "-c", PROGRAMS], **pipes) as programs:
+
+        def called_from(folder: Path, call: str = CALL) -> str:
+            print(folder, call, file=programs.stdin, flush=True)
+            return programs.stdout.readline().strip()
+
+        yield called_from
 
 
 @pytest.fixture(scope="module")
-def compiled(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def compiled(tmp_path_factory: pytest.TempPathFactory, called_from: Programs) -> Path:
     """Write a package with a kernel, and have it compiled."""
     folder = tmp_path_factory.mktemp("compiled")
     (folder / "made").mkdir()
@@ -40,13 +77,6 @@ def package(compiled: Path, tmp_path: Path) -> Path:
     return shutil.copytree(compiled, tmp_path, dirs_exist_ok=True)
 
 
-def called_from(folder: Path, call: str = CALL) -> str:
-    """Call the kernel in a program of its own: what it returns, and how many kernels came from the cache."""
-    program = f"import sys; sys.path.insert(0, {str(folder)!r}); sys.dont_write_bytecode = True; {call}"
-    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True)
-    return done.stdout.strip()
-
-
 @pytest.mark.parametrize(
     ("file", "before", "after", "expected"),
     [
@@ -59,7 +89,7 @@ def called_from(folder: Path, call: str = CALL) -> str:
     ],
 )
 def test_a_kernel_is_compiled_anew_where_what_it_was_made_of_has_changed_and_nowhere_else(
-    package: Path, file: str, before: str, after: str, expected: str
+    package: Path, called_from: Programs, file: str, before: str, after: str, expected: str
 ) -> None:
     path = package / "made" / f"{file}.py"
     path.write_text(path.read_text().replace(before, after))
@@ -68,7 +98,7 @@ def test_a_kernel_is_compiled_anew_where_what_it_was_made_of_has_changed_and_now
 
 @pytest.mark.parametrize("file", ["pairs", "others"])
 def test_a_kernel_is_compiled_anew_where_a_type_that_it_takes_has_another_name_or_place(
-    tmp_path: Path, file: str
+    tmp_path: Path, called_from: Programs, file: str
 ) -> None:
     made = tmp_path / "made"
     made.mkdir()
