@@ -8,6 +8,7 @@ its tests take:
 
 from __future__ import annotations
 
+import multiprocessing
 import subprocess
 import sys
 from collections.abc import Iterable, Iterator
@@ -27,6 +28,8 @@ from gsseg_core.learn.learner import Learner
 distributed = pytest.importorskip("distributed", reason="Dask is not installed")
 dask = pytest.importorskip("dask")
 
+_NEEDED = ["distributed", "gsseg_core.learn.distributed.dask_worker", "gsseg_core.raster.cpu.tile_operator"]
+
 SCENE, _ = balls_on_a_table()
 VIEWS = wrong_views(7)
 VIEWS[4] = with_clutter(VIEWS[4])
@@ -36,9 +39,12 @@ SETTINGS = EMSettings(max_steps=6, tolerance=0.0)
 @contextmanager
 def workers(count: int) -> Iterator[str]:
     """The address of a scheduler with some workers, each a process of one thread."""
-    patient = {f"distributed.comm.timeouts.{name}": f"{PATIENCE:g}s" for name in ("connect", "tcp")}
+    multiprocessing.get_context("forkserver").set_forkserver_preload(_NEEDED)
+    settings = {f"distributed.comm.timeouts.{name}": f"{PATIENCE:g}s" for name in ("connect", "tcp")}
     with (
-        dask.config.set(patient),
+        # They begin as copies of a process that has imported what they need.
+        dask.config.set({**settings, "distributed.worker.multiprocessing-method": "forkserver"}),
+        mock.patch.object(distributed.utils, "_forkserver_preload_set", True),
         mock.patch.object(scheduler, "PATIENCE", PATIENCE),
         distributed.LocalCluster(
             processes=True, n_workers=count, threads_per_worker=1, dashboard_address="127.0.0.1:0", silence_logs=50
