@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import fcntl
 import gzip
 import io
 import json
 import struct
 import zipfile
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 import numpy as np
@@ -61,12 +63,23 @@ def by_library(kind: str, **options: int) -> Callable[[Path, GaussianScene], Non
     return write
 
 
+@contextmanager
+def gsply_alone() -> Iterator[None]:
+    """Keep other workers from compiling what gsply compiles here: seconds later they find it in its cache."""
+    import gsply
+
+    with open(gsply.__file__) as file:
+        fcntl.flock(file, fcntl.LOCK_EX)
+        yield
+
+
 def write_compressed_ply(path: Path, scene: GaussianScene) -> None:
     """Have gsply write a compressed PLY."""
     import gsply
 
     scene.save(path.with_name("for_gsply.ply"))
-    gsply.plywrite(str(path), gsply.plyread(str(path.with_name("for_gsply.ply"))), compressed=True)
+    with gsply_alone():
+        gsply.plywrite(str(path), gsply.plyread(str(path.with_name("for_gsply.ply"))), compressed=True)
 
 
 def spz_body(scene: GaussianScene, version: int, *, turned: bool = True) -> bytes:
