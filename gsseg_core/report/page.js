@@ -15,7 +15,8 @@ for (const field of document.querySelectorAll(".search")) {
 (() => {
   const canvas = document.querySelector(".stage canvas");
   const say = (text) => document.querySelector("#preview").insertAdjacentText("beforeend", text);
-  const gl = canvas.getContext("webgl2", { antialias: true, alpha: false });
+  // Printed or saved as a picture, a canvas that does not keep what was drawn is black.
+  const gl = canvas.getContext("webgl2", { antialias: true, alpha: false, preserveDrawingBuffer: true });
   if (!gl) return say("The preview in 3D needs WebGL 2, which this browser does not offer.");
   const data = JSON.parse(document.getElementById("preview-data").textContent);
   const records = Uint8Array.from(atob(document.getElementById("preview-records").textContent), (c) => c.charCodeAt(0));

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import base64
 import re
 from functools import partial
 from io import BytesIO
@@ -278,6 +279,12 @@ def test_paper_gets_dark_letters_an_undistorted_preview_and_nothing_to_press(chr
         for pressed in ("nav", ".controls", ".search", ".hint", ".only"):
             assert not any(one.is_visible() for one in page.locator(pressed).all())
         assert page.evaluate("getComputedStyle(document.querySelector('i.s0')).printColorAdjust") == "exact"
+
+
+def test_the_preview_is_not_black_when_it_is_printed_or_saved_as_a_picture(opened: Page) -> None:
+    opened.wait_for_timeout(500)  # Until it is on the screen, it is there in any case.
+    kept = opened.locator(CANVAS).evaluate("c => c.toDataURL().split(',')[1]")
+    assert np.asarray(Image.open(BytesIO(base64.b64decode(kept))).convert("L")).std() > 5
 
 
 def test_a_sheet_of_paper_has_all_classes_and_all_pictures(chromium: Browser, long_report: str) -> None:
