@@ -132,5 +132,7 @@ def evaluation_summary(scores: Mapping[str, Any]) -> str:
 
 
 def percent(value: float | None) -> str:
-    """Write a ratio in percent, a dash where it is undefined."""
-    return "-" if value is None else f"{100 * value:.1f} %"
+    """Write a ratio in percent, a dash where it is undefined; what is little is not nothing."""
+    if value is None:
+        return "-"
+    return "<0.1 %" if 0 < value < 0.0005 else f"{100 * value:.1f} %"

@@ -230,7 +230,7 @@ def reliability_report(checks: Iterable[ViewCheck], class_names: Mapping[int, st
             "num_pixels": check.num_pixels,
             "rejected_share": round(check.rejected, 4),
             "confusions": [
-                {"true": name(k), "seen": name(y), "share": round(share, 4)} for k, y, share in check.confusions()
+                {"true": name(k), "seen": name(y), "share": round(share, 6)} for k, y, share in check.confusions()
             ],
         }
         for check in worst_views(checks)

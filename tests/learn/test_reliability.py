@@ -23,6 +23,7 @@ from gsseg_core.learn.em.em_learner import EMLearner
 from gsseg_core.learn.mask_reliability import ViewCheck, check_views, compare_mask, reliability_report, worst_views
 from gsseg_core.learn.temperature import grid_of
 from gsseg_core.report.pictures import ViewImages
+from gsseg_core.text import percent
 
 SCENE, _ = balls_on_a_table()
 CLEAN = clean_views(12)
@@ -86,6 +87,13 @@ def test_report_is_sorted_worst_first_and_plain_json() -> None:
         shares = [confusion["share"] for confusion in entry["confusions"]]
         assert shares == sorted(shares, reverse=True) and 0 < sum(shares) <= 1 - entry["reliability"] + 1e-3
         assert all({confusion["true"], confusion["seen"]} <= set(NAMES.values()) for confusion in entry["confusions"])
+
+
+def test_a_share_of_a_few_pixels_is_not_said_to_be_nothing() -> None:
+    check = ViewCheck("a", 400_000, np.array([0, 1]), CSRRows.from_dense(np.array([[399_990, 10], [0, 0]])))
+    (confusion,) = reliability_report([check], NAMES)[0]["confusions"]
+    assert confusion["share"] > 0 and percent(confusion["share"]) == "<0.1 %"
+    assert [percent(value) for value in (0.0, 0.0006, 1.0, None)] == ["0.0 %", "0.1 %", "100.0 %", "-"]
 
 
 def test_a_view_is_held_against_the_others_only() -> None:
