@@ -13,6 +13,7 @@ from PIL import Image, ImageDraw, ImageFont
 from gsseg_core.data.label_images import run_text
 from gsseg_core.files.atomic import write_atomically
 from gsseg_core.kernels.compiler import kernel
+from gsseg_core.text import composed, printable
 
 BACKGROUND = (58, 60, 66)  # colour of label 0, a dark neutral grey
 PAPER, INK, FAINT_INK = (255, 255, 255), (32, 34, 38), (128, 131, 138)
@@ -189,7 +190,7 @@ def shrunk(image: np.ndarray, px: int) -> np.ndarray:  # (H, W, 3) uint8
 
 def _shorten(text: str, font: ImageFont.FreeTypeFont | ImageFont.ImageFont, width: float) -> str:
     """Cut a text so that it fits into a width in px, with an ellipsis where it was cut."""
-    text = "".join("\ufffd" if ord(c) < 32 or 0xD800 <= ord(c) < 0xE000 else c for c in text[:_LONGEST])
+    text = composed(printable(text[:_LONGEST]))  # The font has accented letters, and no accents to put on others.
     if font.getlength(text) <= width:
         return text
     while text and font.getlength(text + "...") > width:

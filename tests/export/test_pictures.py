@@ -131,6 +131,14 @@ def test_a_legend_has_a_swatch_for_every_class_in_as_many_columns_as_it_takes() 
     assert legend({}, colors, np.zeros(60, int)).ndim == 3
 
 
+def test_names_on_pictures_are_written_as_everywhere_else() -> None:
+    def drawn(name: str) -> np.ndarray:
+        return legend({1: name}, palette(2), np.zeros(2, int))
+
+    np.testing.assert_array_equal(drawn("e\u0301clair"), drawn("\u00e9clair"))  # as macOS writes it
+    np.testing.assert_array_equal(drawn("exe.\u202egnp"), drawn(r"exe.\u202egnp"))
+
+
 def test_a_legend_of_hundreds_of_classes_is_about_as_wide_as_high() -> None:
     for count in (300, 1000):
         sheet = legend({k: f"object_{k:03d}" for k in range(count)}, palette(count), np.full(count, 1_000))
