@@ -6,6 +6,7 @@ that checks both first. Where another version of viser starts its server in anot
 
 from __future__ import annotations
 
+import asyncio
 import contextlib
 import inspect
 import io
@@ -33,6 +34,7 @@ MOST_BYTES = 2**20  # of one message from a browser; the largest is a small pict
 LARGEST_WINDOW = 2**14  # pixels of a browser's picture, each way, at most
 PATIENCE = 60.0  # seconds for a browser to say what it wants once it is connected, and to show that it is still there
 _LARGEST_NUMBER, _LONGEST_TEXT = 1e9, 1000
+_SOON = 0.02  # seconds until it is looked again whether the server is made
 
 _HEARD = ("ViewerCameraMessage", "ScenePointerMessage", "GuiUpdateMessage", "GetRenderResponseMessage")
 """What a page sends that the viewer has a use for. viser itself would also take files, and open itself to everybody."""
@@ -69,8 +71,8 @@ def start_server(listener: Listener) -> viser.ViserServer:
 
 @contextlib.contextmanager
 def _guarding(listener: Listener) -> Iterator[threading.Event]:
-    """Have the server that viser starts meanwhile guarded; the event is set once it has."""
-    real, guarded = websockets.asyncio.server.serve, threading.Event()
+    """Have the server that viser starts meanwhile guarded, and answer at the end; the event is set once it has."""
+    real, guarded, over = websockets.asyncio.server.serve, threading.Event(), threading.Event()
 
     def serve(handler: Any, *_: object, process_request: Any = None, **options: Any) -> Any:
         async def process(connection: ServerConnection, request: Request) -> Response | None:
@@ -78,6 +80,8 @@ def _guarding(listener: Listener) -> Iterator[threading.Event]:
             refusal = listener.refusal(*asked)
             if refusal is not None:
                 return connection.respond(HTTPStatus.FORBIDDEN, f"gsseg: {refusal}\n")
+            while not over.is_set():  # A page of an earlier viewer comes at once, before viser knows how to answer it.
+                await asyncio.sleep(_SOON)
             response = process_request(connection, request)
             answer: Response | None = await response if inspect.isawaitable(response) else response
             if answer is not None:
@@ -94,6 +98,7 @@ def _guarding(listener: Listener) -> Iterator[threading.Event]:
         yield guarded
     finally:
         websockets.asyncio.server.serve = real  # type: ignore[misc]
+        over.set()
 
 
 def understood(data: Any) -> bool:

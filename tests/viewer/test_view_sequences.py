@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import socket
 import threading
 from collections.abc import Callable, Iterator
-from contextlib import closing
+from contextlib import closing, redirect_stdout
 from dataclasses import replace
+from io import StringIO
 from pathlib import Path
 from typing import Any
 from unittest.mock import MagicMock
@@ -15,10 +17,12 @@ import pytest
 from labellings import labelled, probabilities_of
 from operator_cases import make_scene
 from parts_of_balls import tree_of_balls
-from patience import wait_until
+from patience import PATIENCE, wait_until
 from small_scenes import NAMES, balls_on_a_table, ring
 
 pytest.importorskip("viser")
+
+from viser.infra._infra import WebsockServer
 
 from gsseg_core.scene.camera import Camera
 from gsseg_core.segmentation import Segmentation
@@ -28,6 +32,7 @@ from gsseg_core.viewer.access import listen
 from gsseg_core.viewer.clients import SERVER, ClientRenderers
 from gsseg_core.viewer.corrections import disc
 from gsseg_core.viewer.model import ClassRow, Labelling, ViewModel
+from gsseg_core.viewer.server import start_server
 from gsseg_core.viewer.state import ViewerState
 from gsseg_core.viewer.viewer import Viewer
 
@@ -321,3 +326,30 @@ def test_a_class_that_turns_up_leaves_the_buttons_before_it_to_be_pressed() -> N
             orders = [button.order for button in buttons.values()]
             assert orders == sorted(orders)
             before = buttons
+
+
+def test_a_page_that_is_still_open_connects_to_the_next_viewer_once_that_is_made(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    real, listener = WebsockServer.start, listen(port=18310)
+    page = socket.create_connection(("127.0.0.1", listener.port))
+
+    def start(server: WebsockServer) -> None:
+        real(server)
+        asked = {"Host": f"127.0.0.1:{listener.port}", "Upgrade": "websocket", "Connection": "Upgrade"}
+        asked |= {"Sec-WebSocket-Key": "AAAAAAAAAAAAAAAAAAAAAA==", "Sec-WebSocket-Version": "13"}
+        lines = ["GET / HTTP/1.1", *(f"{name}: {value}" for name, value in asked.items()), "", ""]
+        page.sendall("\r\n".join(lines).encode())
+        page.settimeout(0.3)
+        with pytest.raises(TimeoutError):
+            page.recv(1)  # What viser would do with it needs what it has not made yet.
+
+    monkeypatch.setattr(WebsockServer, "start", start)
+    with closing(listener), closing(page):
+        server = start_server(listener)
+        try:
+            page.settimeout(PATIENCE)
+            assert page.recv(12) == b"HTTP/1.1 101"
+        finally:
+            with redirect_stdout(StringIO()):
+                server.stop()
