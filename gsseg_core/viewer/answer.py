@@ -1,7 +1,7 @@
 """What the viewer answers to a click, to errors and while a long job runs, above the tabs of its panel.
 
 viser draws Markdown with whatever HTML stands in it. So text of others, which names and errors hold, gets there only
-through `paragraph`, and into labels, which are text, only through `shown_name`.
+through `paragraph` or `_isolated`, and into labels, which are text, only through `shown_name`.
 """
 
 from __future__ import annotations
@@ -107,7 +107,7 @@ class Answer:
         labels, shares, names, _ = model.labelling
         label, probabilities = int(labels[i]), shares.take(np.array([i])).dense(len(names))[0]
         best = [k for k in np.argsort(-probabilities, kind="stable")[:MOST_CLASSES].tolist() if probabilities[k] > 0]
-        likely = ", ".join(f"{shown_name(model.name(k))} {probabilities[k]:.2f}" for k in best)
+        likely = ", ".join(f"{_isolated(model.name(k))} {probabilities[k]:.2f}" for k in best)
         lines = [
             f", class {model.ids()[label]}" if label >= 0 else "",
             f"Gaussian {i}, {100 * picked.weight:.0f} % of the pixel",
@@ -117,10 +117,10 @@ class Answer:
             views = counted(len({vote.view for vote in votes}), "view")
             lines.append(f"{views} voted for it" + (", the largest votes:" if votes else ""))
             lines += [
-                f"{shown_name(v.view)}: {shown_name(class_name(classes, v.label))}, {v.weight:.1f} px"
+                f"{_isolated(v.view)}: {_isolated(class_name(classes, v.label))}, {v.weight:.1f} px"
                 for v in votes[:MOST_VIEWS]
             ]
-        return paragraph(*lines, title=shown_name(model.name(label)))
+        return _of_html(*lines, title=shown_name(model.name(label)))
 
 
 def shown_name(name: str) -> str:
@@ -130,5 +130,14 @@ def shown_name(name: str) -> str:
 
 def paragraph(*lines: str, title: str = "") -> str:
     """HTML of lines that hold text of any origin; `title` begins the first one, in bold."""
-    content = "<br>".join(map(html_text, lines))
-    return f'<div style="{_STYLE}"><strong>{html_text(title)}</strong>{content}</div>'
+    return _of_html(*map(html_text, lines), title=title)
+
+
+def _isolated(name: str) -> str:
+    """HTML of a name, which leaves in its place what stands beside it though it is read from the right."""
+    return f"<bdi>{html_text(shown_name(name))}</bdi>"
+
+
+def _of_html(*lines: str, title: str) -> str:
+    """HTML of lines of HTML, and a title that is text; as `paragraph`."""
+    return f'<div style="{_STYLE}"><strong>{html_text(title)}</strong>{"<br>".join(lines)}</div>'

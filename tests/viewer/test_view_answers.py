@@ -25,7 +25,7 @@ from gsseg_core.viewer.access import listen
 from gsseg_core.viewer.clients import SERVER
 from gsseg_core.viewer.corrections import disc
 from gsseg_core.viewer.model import ViewModel
-from gsseg_core.viewer.picking import Picked
+from gsseg_core.viewer.picking import Picked, ViewVote
 from gsseg_core.viewer.viewer import Viewer
 
 SCENE, TRUTH = balls_on_a_table()
@@ -70,6 +70,15 @@ def test_the_answer_to_a_click_follows_corrections_and_what_takes_them_back(view
     state.undo()
     tells(NAMES[1])
     assert answer._parts.visible and not answer._whole.visible
+
+
+def test_names_that_are_read_from_the_right_leave_numbers_beside_them_in_order() -> None:
+    named = LEARNT._replace(class_names={k: "\u05db\u05d9\u05e1\u05d0 " * k for k in NAMES})
+    with closing(Viewer(ViewModel(SCENE, named), listener=listen(port=PORT), draw=SERVER)) as opened:
+        answer, name = opened.panel.answer, f"<bdi>{named.class_names[1]}</bdi>"
+        answer.show_picked(answer.ask(), Picked(IN_BALL, 0.5), [ViewVote("view", 1, 2.5)])
+        assert f"probabilities: {name} 0.90" in answer._answer.content
+        assert f"<bdi>view</bdi>: {name}, 2.5 px" in answer._answer.content
 
 
 def test_an_earlier_click_says_nothing_any_more_once_a_later_one_is_answered(viewer: Viewer) -> None:
