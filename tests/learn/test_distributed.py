@@ -29,6 +29,7 @@ from gsseg_core.data.view import View
 from gsseg_core.learn.distributed.dask_learners import DistributedEM, DistributedVotes
 from gsseg_core.learn.em.em_learner import EMLearner, EMSettings
 from gsseg_core.learn.vote_learner import VoteLearner
+from gsseg_core.raster.vote_total import VoteTotal
 
 Told = tuple[str, int, int]
 
@@ -90,6 +91,20 @@ def test_votes_on_workers_equal_votes_here_as_views_come_and_go(client: Any) -> 
         learner.retract(VIEWS[1].name)
         assert learner.observe(View.from_arrays(VIEWS[2].camera, VIEWS[3].read_labels()))
     assert_same(there, here)
+
+
+def test_where_there_is_no_memory_for_votes_no_view_is_listed(client: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+    learner = DistributedVotes(client, SCENE, NUM_CLASSES)
+
+    def full(*_: object) -> None:
+        raise MemoryError
+
+    with monkeypatch.context() as patch, pytest.raises(MemoryError):
+        patch.setattr(VoteTotal, "_make_room", full)
+        learner.observe_all(VIEWS)
+    assert not learner.views
+    learner.observe_all(VIEWS)
+    assert_same(learner, taught(VoteLearner(SCENE, NUM_CLASSES), VIEWS))
 
 
 def test_without_memory_for_prepared_views_the_result_is_the_same(client: Any) -> None:
