@@ -45,6 +45,7 @@ class Frames:
         self._closing.set()
         self._stale.set()
         self._thread.join()
+        self._operators.clear()  # viser's handle and this refer to each other: only a search for circles frees the two.
 
     def _keep_drawing(self) -> None:
         while self._stale.wait() and not self._closing.is_set():

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import weakref
 from collections.abc import Callable
 from contextlib import closing
 
@@ -119,3 +120,13 @@ def test_after_the_end_no_image_comes() -> None:
     client.move(None)
     frames.show(picture(TRUTH == 1))
     assert not frames._thread.is_alive() and len(client.images) == count
+
+
+def test_of_a_browser_that_has_left_no_projected_scene_is_kept() -> None:
+    client = Client()
+    frames = Frames(client)  # type: ignore[arg-type]
+    frames.show(picture(TRUTH > 0))
+    client.wait_for(2)
+    kept = [weakref.ref(operator) for operator in frames._operators.values()]
+    frames.close()
+    assert kept and not any(operator() for operator in kept)
