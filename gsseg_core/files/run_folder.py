@@ -116,14 +116,17 @@ class StagedRun:
             raise _unwritable(self.out, error) from error
 
     def claim(self, places: Iterable[str]) -> None:
-        """Raise `PathTakenError` if a place that the run will write is taken by what no run of its kind wrote."""
-        manifest = Manifest.read(self.out / RUN_FILE)
+        """Raise `PathTakenError` if a place that the run will write is taken by what no run of its kind wrote.
+
+        `WriteError` where that cannot be read, as where `out` is no folder any more.
+        """
+        manifest = self._before()
         for place in places:
             _check_free(self.out, place, manifest, self._kind)
 
     def keep_apart(self, inputs: Iterable[str | os.PathLike[str]]) -> None:
         """Raise `PathTakenError` if what the run reads is the folder that it writes to, or goes with its last run."""
-        gone = {os.path.realpath(self.out / place) for place in Manifest.read(self.out / RUN_FILE).files(self._kind)}
+        gone = {os.path.realpath(self.out / place) for place in self._before().files(self._kind)}
         for path in filter(os.path.exists, inputs):
             if os.path.samefile(self.out, path):
                 raise PathTakenError(
@@ -134,6 +137,12 @@ class StagedRun:
                     f"{file}: is read by gsseg {self._kind}, which would replace it with all other results in "
                     f"{self.out}; expected another folder for the new ones"
                 )
+
+    def _before(self) -> Manifest:
+        try:
+            return Manifest.read(self.out / RUN_FILE)
+        except OSError as error:
+            raise _unwritable(self.out, error) from error
 
     def commit(self) -> None:
         """Make what was written the result."""

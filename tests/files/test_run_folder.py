@@ -258,6 +258,16 @@ def test_a_place_that_is_taken_is_refused_by_name_before_the_work(
     assert sorted(path.name for path in tmp_path.iterdir()) == sorted({"elsewhere", place})
 
 
+def test_a_folder_that_a_file_replaces_during_the_run_is_one_clear_error(tmp_path: Path) -> None:
+    out = tmp_path / "out"
+    found = r"out: cannot be written \(Not a directory\)"
+    with pytest.raises(WriteError, match=found), staged_run(out, "segment") as run:
+        shutil.rmtree(out)
+        out.write_text("mine")
+        run.claim(["a.npz"])
+    assert out.read_text() == "mine"
+
+
 def test_of_two_runs_at_once_the_last_to_end_wins_whole(tmp_path: Path) -> None:
     ids, errors = [], []
 
