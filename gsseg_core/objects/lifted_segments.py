@@ -100,6 +100,8 @@ class Profiles:
         """Add the segments of a view to their objects."""
         part = _by_object(segments, objects, int(objects.max(initial=0)) + 1).tocoo()
         at = segments.gaussians[part.row], part.col
+        if sum(more.nnz for more in self._more) > self._sum.nnz:  # Nobody may ask for the sum, view after view.
+            self._add_up()
         self._more.append(sparse.coo_matrix((part.data, at), shape=(len(self), part.shape[1])))
 
     def renumbered(self, objects: np.ndarray) -> Profiles:  # (K,)
@@ -116,11 +118,14 @@ class Profiles:
     def weights(self) -> sparse.csr_matrix:
         """The sum, (N, K) csr_matrix of float64."""
         if self._more:
-            parts = [self._sum.tocoo(), *self._more]
-            row, col, data = (np.concatenate([getattr(p, name) for p in parts]) for name in ("row", "col", "data"))
-            shape = (len(self), int(max(part.shape[1] for part in parts)))
-            self._sum, self._more = sparse.coo_matrix((data, (row, col)), shape=shape).tocsr(), []
+            self._add_up()
         return self._sum
+
+    def _add_up(self) -> None:
+        parts = [self._sum.tocoo(), *self._more]
+        row, col, data = (np.concatenate([getattr(p, name) for p in parts]) for name in ("row", "col", "data"))
+        shape = (len(self), int(max(part.shape[1] for part in parts)))
+        self._sum, self._more = sparse.coo_matrix((data, (row, col)), shape=shape).tocsr(), []
 
     def common(self, segments: Lifted) -> tuple[np.ndarray, np.ndarray]:
         """How much of L segments of a view lies on each object, (L, K), and on known Gaussians, (L,), in px."""

@@ -6,9 +6,10 @@ import numba as nb
 import numpy as np
 from hypothesis import given
 from hypothesis import strategies as st
+from scipy import sparse
 from small_scenes import balls_on_a_table, clean_views
 
-from gsseg_core.objects.lifted_segments import Lifted, without_gaps
+from gsseg_core.objects.lifted_segments import Lifted, Profiles, without_gaps
 from gsseg_core.raster.backends import make_operator
 from gsseg_core.raster.observation import LabelWeights
 
@@ -84,3 +85,15 @@ def test_numbers_get_places_without_gaps_as_unique_gives_them(numbers: list[int]
     for found, expected in zip(without_gaps(array), np.unique(array, return_inverse=True), strict=True):
         assert found.dtype == np.int32
         np.testing.assert_array_equal(found, expected)
+
+
+def test_views_that_are_added_for_ever_take_no_more_and_more_memory() -> None:
+    rng, profiles, gaussians = np.random.default_rng(0), Profiles.empty(50), np.arange(50, dtype=np.int32)
+    expected, kept = np.zeros((50, 4)), []
+    for _ in range(60):
+        weights = rng.integers(1, 9, (4, 50)).astype(np.float32)
+        profiles.add(Lifted(np.arange(4, dtype=np.int32), gaussians, sparse.csr_matrix(weights)), np.arange(4))
+        expected += weights.T
+        kept.append(profiles._sum.nnz + sum(part.nnz for part in profiles._more))
+    assert max(kept) <= 3 * expected.size
+    np.testing.assert_array_equal(profiles.weights.toarray(), expected)
