@@ -126,9 +126,10 @@ def test_a_signal_in_a_real_process_ends_it_without_a_traceback_and_leaves_nothi
     place: Path, number: signal.Signals
 ) -> None:
     before = contents(place / "out")
-    # The learner waits, so that the signal meets it at work; the warm-up, which tells nobody, goes on.
+    # The learner waits, so that the signal meets it at work; the warm-up, which tells nobody, goes on. A test run by
+    # `nohup` is deaf to SIGHUP, and what it starts would be, too.
     program = (
-        "import sys, time\nfrom gsseg_core.cli.main import main\n"
+        "import signal, sys, time\nsignal.signal(signal.SIGHUP, signal.SIG_DFL)\nfrom gsseg_core.cli.main import main\n"
         "from gsseg_core.learn.vote_learner import VoteLearner\n"
         "def fit(self, progress=None):\n"
         "    if progress: progress('learn', 0, 9); print('at work', file=sys.stderr); time.sleep(3600)\n"
