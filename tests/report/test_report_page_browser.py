@@ -282,7 +282,8 @@ def test_paper_gets_dark_letters_an_undistorted_preview_and_nothing_to_press(chr
 
 
 def test_the_preview_is_not_black_when_it_is_printed_or_saved_as_a_picture(opened: Page) -> None:
-    opened.wait_for_timeout(500)  # Until it is on the screen, it is there in any case.
+    # Until it is on the screen, it is there in any case.
+    opened.evaluate("new Promise((done) => requestAnimationFrame(() => requestAnimationFrame(() => setTimeout(done))))")
     kept = opened.locator(CANVAS).evaluate("c => c.toDataURL().split(',')[1]")
     assert np.asarray(Image.open(BytesIO(base64.b64decode(kept))).convert("L")).std() > 5
 

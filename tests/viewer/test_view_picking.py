@@ -39,6 +39,14 @@ def test_a_ray_hits_the_class_that_its_pixel_shows() -> None:
     assert hits > 100
 
 
+def test_a_ray_hits_the_gaussian_of_the_greatest_weight_of_that_pixel() -> None:
+    row, column = (int(i) for i in np.argwhere(LABELS == 2)[20])
+    weights = make_operator(SCENE, CAMERA).weights(row, column)
+    picked = pick(SCENE, CAMERA, CAMERA.center, ray(CAMERA, column + 0.5, row + 0.5))
+    assert picked is not None and picked.gaussian == weights.gaussians[weights.weights.argmax()]
+    assert picked.weight == pytest.approx(weights.weights.max(), abs=1e-5)
+
+
 @pytest.mark.parametrize("size", [(64, 48), (320, 200)])
 def test_a_click_hits_what_makes_most_of_its_pixel_wherever_that_is_in_the_picture(size: tuple[int, int]) -> None:
     rng = np.random.default_rng(0)
