@@ -14,23 +14,23 @@ def current_codes(votes: Learner, learnt: Learnt | None) -> CSRRows:
     codes = votes.vote_rows()
     if learnt is None:
         return codes
-    return codes.replaced(np.where(_settled(votes, learnt), np.arange(codes.num_rows), -1), learnt.codes)
+    settled = _settled(learnt, votes.evidence())
+    return codes.replaced(np.where(settled, np.arange(codes.num_rows), -1), learnt.codes)
 
 
 def current_evidence(votes: Learner, learnt: Learnt | None) -> np.ndarray | None:
     """Tell by how many px each of these codes was seen, (N,) float32; None where an older state does not say."""
+    evidence = votes.evidence()
     if learnt is None:
-        return votes.evidence()
-    return None if learnt.evidence is None else np.where(_settled(votes, learnt), learnt.evidence, votes.evidence())
+        return evidence
+    return None if learnt.evidence is None else np.where(_settled(learnt, evidence), learnt.evidence, evidence)
 
 
-def _settled(votes: Learner, learnt: Learnt) -> np.ndarray:
-    """Tell of which Gaussians what was learnt holds, (N,) bool, be it that nothing is known.
+def _settled(learnt: Learnt, evidence: np.ndarray) -> np.ndarray:
+    """Tell of which Gaussians what was learnt holds, (N,) bool, be it that nothing is known; the evidence is of votes.
 
     What learning saw and left unknown, it saw by labels that it rejected: votes for these must not come back. Where
     other views have seen as much of a Gaussian, votes have the say again.
     """
-    known, evidence = learnt.codes.known(), learnt.evidence
-    if evidence is None or not ((evidence > 0) & ~known).any():
-        return known
-    return known | (evidence > votes.evidence() / 2)
+    known = learnt.codes.known()
+    return known if learnt.evidence is None else known | (learnt.evidence > evidence / 2)

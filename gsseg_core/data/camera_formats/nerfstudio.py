@@ -34,14 +34,15 @@ def read_nerfstudio(path: Path, within: Path | None) -> list[Camera]:
         if matrix.shape == (4, 4) and not np.allclose(matrix[3], (0, 0, 0, 1), 0, RIGID_TOLERANCE):
             raise PoseError(f"{where}: the last row of the pose is {matrix[3].tolist()}; expected 0 0 0 1")
         pose = inverse_pose(matrix[:3, :3] * (1, -1, -1), matrix[:3, 3])
-        if "w" not in entry or "h" not in entry:
-            entry.fields.update(zip("wh", _size_of_image(path, entry, within), strict=True))
-        cameras += cameras_of(where, name, _intrinsics(entry), pose)
+        cameras += cameras_of(where, name, _intrinsics(entry, path.parent, within), pose)
     return cameras
 
 
-def _intrinsics(entry: Entry) -> Intrinsics:
-    """Read the lens of a frame; as in nerfstudio, a camera model without distortion may have it all the same."""
+def _intrinsics(entry: Entry, folder: Path, within: Path | None) -> Intrinsics:
+    """Read the lens of a frame, whose image is named from `folder`.
+
+    As in nerfstudio, a camera model without distortion may have it all the same.
+    """
     where, name = entry.where, str(entry.fields.get("camera_model") or "OPENCV").upper()
     model = MODELS_BY_NAME.get("OPENCV_FISHEYE" if entry.fields.get("is_fisheye") else name, _BROWN)
     if name not in MODELS_BY_NAME and name != "PERSPECTIVE":
@@ -49,7 +50,8 @@ def _intrinsics(entry: Entry) -> Intrinsics:
         raise IntrinsicsError(f"{where}: camera model is {clipped(name)}; expected {known}: undistort the images first")
     if model.projection is Projection.PERSPECTIVE and not model.rational:
         model = _BROWN
-    width, height = entry.size("w"), entry.size("h")
+    sized = "w" in entry and "h" in entry
+    width, height = (entry.size("w"), entry.size("h")) if sized else _size_of_image(entry, folder, within)
     if model.projection is Projection.PANORAMA:
         return Intrinsics(model, (width, height), (1.0, 1.0), (0.0, 0.0))
     fx, fy = _focal(entry, "fl_x", "camera_angle_x", width), _focal(entry, "fl_y", "camera_angle_y", height)
@@ -61,9 +63,9 @@ def _intrinsics(entry: Entry) -> Intrinsics:
     return Intrinsics(model, (width, height), (fx, fx if fy is None else fy), (cx, cy), coefficients)
 
 
-def _size_of_image(path: Path, entry: Entry, within: Path | None) -> tuple[int, int]:
+def _size_of_image(entry: Entry, folder: Path, within: Path | None) -> tuple[int, int]:
     """Ask the image of a frame for its width and height; PNG is its suffix where the file leaves that out."""
-    image = path.parent / entry.fields["file_path"]
+    image = folder / entry.fields["file_path"]
     image = image if image.suffix.lower() in READABLE_IMAGES else Path(f"{image}.png")
     try:
         with open_image(image, IntrinsicsError, "image", "a photo", within=within) as photo:
