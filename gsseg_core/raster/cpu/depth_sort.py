@@ -7,9 +7,9 @@ import numpy as np
 
 from gsseg_core.kernels.compiler import kernel
 
-FEW = 1 << 20  # keys: of more, those that are moved would go to too many places at once for the cache
-DIGIT_BITS = (11, 8)  # of few keys, whose three digits are counted in the fastest cache, and of more
+DIGIT_BITS = (8, 13)  # of a digit: the least for few keys, whose digits must be counted fast, and the most
 PARTS = 4  # parts that are counted and moved beside each other; fixed, so that threads change nothing
+_KEY = 32  # bits of a row, after which its key begins
 
 
 def sort_by_depth(depth: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -21,41 +21,58 @@ def sort_by_depth(depth: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 def sort_keys(keys: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Order (M,) int32 that sorts keys, (M,) uint32, and the sorted keys; equal ones stay in their order.
 
-    A radix sort: every pass moves the keys stably by one digit, the least significant first.
+    A radix sort: every pass moves the keys stably by one digit, the least significant first. A key lies beside its row,
+    so that both move at once, and counts from the least, as there may be fewer digits then.
     """
-    order = np.arange(len(keys), dtype=np.int32)
-    bits = DIGIT_BITS[len(keys) > FEW]
-    for shift in range(0, 32, bits):
+    least = int(keys.min()) if len(keys) else 0
+    used = (int(keys.max(initial=0)) - least).bit_length()
+    passes = -(-used // int(np.clip(len(keys).bit_length() - 5, *DIGIT_BITS)))
+    bits = -(-used // max(passes, 1))
+    pairs = np.empty(len(keys), np.uint64)
+    _pair(keys, least, pairs)
+    for digit in range(passes):
+        shift = digit * bits + _KEY
         counts = np.zeros((PARTS, 1 << bits), np.int64)
-        _count_digits(keys, shift, counts)
-        if (counts.sum(axis=0) == len(keys)).any():
-            continue  # All keys have the same digit.
-        # Digit by digit, and chunk by chunk within a digit.
+        _count_digits(pairs, shift, counts)
+        # Digit by digit, and part by part within a digit.
         place = (np.cumsum(counts.T) - counts.T.ravel()).reshape(-1, PARTS).T.copy()
-        moved_keys, moved_order = np.empty_like(keys), np.empty_like(order)
-        _move(keys, order, shift, place, moved_keys, moved_order)
-        keys, order = moved_keys, moved_order
-    return order, keys
+        moved = np.empty_like(pairs)
+        _move(pairs, shift, place, moved)
+        pairs = moved
+    order = np.empty(len(keys), np.int32)
+    _part(pairs, least, order, moved_keys := np.empty_like(keys))
+    return order, moved_keys
 
 
 @kernel(parallel=True)
-def _count_digits(keys: np.ndarray, shift: int, counts: np.ndarray) -> None:
-    count, mask = keys.shape[0], np.uint32(counts.shape[1] - 1)
-    for chunk in nb.prange(PARTS):
-        for i in range(chunk * count // PARTS, (chunk + 1) * count // PARTS):
-            counts[chunk, (keys[i] >> np.uint32(shift)) & mask] += 1
+def _pair(keys: np.ndarray, least: int, pairs: np.ndarray) -> None:
+    for i in nb.prange(keys.shape[0]):
+        pairs[i] = np.uint64(keys[i] - least) << np.uint64(_KEY) | np.uint64(i)
+
+
+@kernel(parallel=True)
+def _part(pairs: np.ndarray, least: int, order: np.ndarray, keys: np.ndarray) -> None:
+    for i in nb.prange(pairs.shape[0]):
+        order[i], keys[i] = np.int32(pairs[i]), least + np.int64(pairs[i] >> np.uint64(_KEY))
+
+
+@kernel(parallel=True)
+def _count_digits(pairs: np.ndarray, shift: int, counts: np.ndarray) -> None:
+    count, mask = pairs.shape[0], np.uint64(counts.shape[1] - 1)
+    for part in nb.prange(PARTS):
+        for i in range(part * count // PARTS, (part + 1) * count // PARTS):
+            counts[part, (pairs[i] >> np.uint64(shift)) & mask] += 1
 
 
 @kernel(parallel=True)
 def _move(
-    keys: np.ndarray, order: np.ndarray, shift: int,  # (M,) uint32, (M,) int32
-    place: np.ndarray,  # (PARTS, digits) where the next key of each digit goes
-    moved_keys: np.ndarray, moved_order: np.ndarray,  # (M,) out, each
+    pairs: np.ndarray, shift: int,  # (M,) uint64
+    place: np.ndarray,  # (PARTS, digits) where the next pair of each digit goes
+    moved: np.ndarray,  # (M,) out
 ) -> None:  # fmt: skip
-    count, mask = keys.shape[0], np.uint32(place.shape[1] - 1)
-    for chunk in nb.prange(PARTS):
-        for i in range(chunk * count // PARTS, (chunk + 1) * count // PARTS):
-            digit = (keys[i] >> np.uint32(shift)) & mask
-            n = place[chunk, digit]
-            place[chunk, digit] = n + 1
-            moved_keys[n], moved_order[n] = keys[i], order[i]
+    count, mask = pairs.shape[0], np.uint64(place.shape[1] - 1)
+    for part in nb.prange(PARTS):
+        for i in range(part * count // PARTS, (part + 1) * count // PARTS):
+            digit = (pairs[i] >> np.uint64(shift)) & mask
+            moved[place[part, digit]] = pairs[i]
+            place[part, digit] += 1
