@@ -13,6 +13,7 @@ root.
 from __future__ import annotations
 
 import threading
+from functools import partial
 from typing import NamedTuple
 
 import numba as nb
@@ -24,6 +25,7 @@ from gsseg_core.raster.cpu.depth_sort import sort_by_depth
 from gsseg_core.raster.cpu.splat import HEIGHT, LOG_ALPHA_MIN, LOG_OPACITY, SHEAR, WIDTH, X_TURN, Y_REACH, U, V
 from gsseg_core.scene.camera import Camera
 from gsseg_core.scene.gaussian_scene import GaussianScene
+from gsseg_core.scene.scene_cache import PerScene
 
 FRUSTUM_MARGIN = 0.3  # of half the image's size, within which around the image the camera is linearised, as in trainers
 REACH_MAX = 1e6  # a reach is cut off here, in px: far beyond any image, and safely an integer
@@ -32,6 +34,7 @@ HALF_LOG2E = 0.5 / np.log(2.0)
 ROOT = np.sqrt(DILATION)
 
 BATCH = 128  # Gaussians that are looked at together before those among them that may be visible are projected
+LOW, HIGH, LONGEST = 0, 3, 6  # Where the bounds of a batch lie: of its means, (3,) each, and its longest axis.
 
 # Where numbers of the Gaussians of a batch lie: so many times BATCH.
 MEAN, QUAT, SCALES, OPACITY, OUT, DEPTH = 0, 3, 7, 10, 11, 19
@@ -84,6 +87,9 @@ class _Splats(NamedTuple):
     log_opacities: np.ndarray  # (N,)
 
 
+_BOUNDS: PerScene[np.ndarray] = PerScene()
+
+
 def project(scene: GaussianScene, camera: Camera) -> Projected:
     """Project a scene and sort what is visible by depth.
 
@@ -92,8 +98,9 @@ def project(scene: GaussianScene, camera: Camera) -> Projected:
     """
     table, depth, ids = _scratch(len(scene))
     splats = _Splats(scene.means, scene.quats, scene.scales, scene.log_opacities)
-    found = _project(splats, Pinhole.of(camera), table, depth, ids)
-    begins = np.arange(CHUNKS) * len(scene) // CHUNKS
+    bounds = _BOUNDS.of(scene, partial(_bounds_of_batches, scene.means, scene.scales))
+    found = _project(splats, bounds, Pinhole.of(camera), table, depth, ids)
+    begins = np.arange(CHUNKS) * len(bounds) // CHUNKS * BATCH
     table, depth, ids = (joined(part, begins, found) for part in (table, depth, ids))
     order, depth = sort_by_depth(depth)
     _break_ties(order, np.flatnonzero(depth[1:] == depth[:-1]), table)
@@ -147,20 +154,41 @@ def _is_before(table: np.ndarray, one: int, other: int) -> bool:
     return bool(one < other)
 
 
+@kernel(parallel=True)
+def _bounds_of_batches(means: np.ndarray, scales: np.ndarray) -> np.ndarray:  # (N, 3), (N, 3)
+    """Bound the Gaussians of each batch: (batches, 7) float32."""
+    count = means.shape[0]
+    bounds = np.empty(((count + BATCH - 1) // BATCH, 7), np.float32)
+    for batch in nb.prange(bounds.shape[0]):
+        begin, end = batch * BATCH, min((batch + 1) * BATCH, count)
+        bound = bounds[batch]
+        bound[LONGEST] = 0
+        for axis in range(3):
+            low = high = means[begin, axis]
+            longest = bound[LONGEST]
+            for i in range(begin, end):
+                low, high = min(low, means[i, axis]), max(high, means[i, axis])
+                longest = max(longest, scales[i, axis])
+            bound[LOW + axis], bound[HIGH + axis], bound[LONGEST] = low, high, longest
+    return bounds
+
+
 @kernel(parallel=True, error_model="numpy")
 def _project(
-    splats: _Splats, lens: Pinhole,
+    splats: _Splats, bounds: np.ndarray, lens: Pinhole,  # (batches, 7) of `_bounds_of_batches`
     table: np.ndarray, depth: np.ndarray, ids: np.ndarray,  # (N, 8), (N,), (N,) out, where each chunk's part begins
 ) -> np.ndarray:  # fmt: skip
     """Project what is visible; returns how many Gaussians of each chunk that are, (CHUNKS,)."""
-    count, found = splats.means.shape[0], np.zeros(CHUNKS, np.int64)
+    count, found, sides = splats.means.shape[0], np.zeros(CHUNKS, np.int64), _sides(lens)
     for chunk in nb.prange(CHUNKS):
-        first, last = chunk * count // CHUNKS, (chunk + 1) * count // CHUNKS
+        first, last = chunk * bounds.shape[0] // CHUNKS, (chunk + 1) * bounds.shape[0] // CHUNKS
         near, shown, who = np.empty(BATCH, np.bool_), np.empty(BATCH, np.bool_), np.empty(BATCH, np.int64)
         lanes = np.empty(NUMBERS * BATCH, np.float64)
-        n = first
-        for begin in range(first, last, BATCH):
-            end = min(begin + BATCH, last)
+        n = first * BATCH
+        for batch in range(first, last):
+            if _is_outside(bounds[batch], sides):
+                continue
+            begin, end = batch * BATCH, min((batch + 1) * BATCH, count)
             _find_near(splats.means[begin:end], splats.scales[begin:end], splats.log_opacities[begin:end], lens, near)
             close = _collect(begin, near[: end - begin], splats, who, lanes)
             _project_near(close, lanes, shown, lens)
@@ -169,8 +197,42 @@ def _project(
                     table[n, column] = lanes[(OUT + column) * BATCH + j]
                 depth[n], ids[n] = lanes[DEPTH * BATCH + j], who[j]
                 n += shown[j]
-        found[chunk] = n - first
+        found[chunk] = n - first * BATCH
     return found
+
+
+@called_by_kernels
+def _sides(lens: Pinhole) -> np.ndarray:
+    """Give the sides of what a camera sees, (5, 5) float64: a, b, c, d and k of each, for `_is_outside`.
+
+    They are those of `_find_near`, with z above half of NEAR, so that rounding throws nothing out.
+    """
+    pose, sides = lens.viewmat, np.empty((5, 5), np.float64)
+    for column in range(4):
+        z = pose[2, column]
+        near = ROOT * LARGEST_REACH * z
+        u = lens.K[0, 0] * pose[0, column] + lens.K[0, 2] * z
+        v = lens.K[1, 1] * pose[1, column] + lens.K[1, 2] * z
+        sides[0, column], sides[1, column], sides[2, column] = z, near + u, near + lens.width * z - u
+        sides[3, column], sides[4, column] = near + v, near + lens.height * z - v
+    sides[0, 3] -= 0.5 * NEAR
+    sides[0, 4] = 0.0
+    sides[1:3, 4] = LARGEST_REACH * lens.K[0, 0] * (1.0 + max(abs(lens.x_low), abs(lens.x_high)))
+    sides[3:, 4] = LARGEST_REACH * lens.K[1, 1] * (1.0 + max(abs(lens.y_low), abs(lens.y_high)))
+    return sides
+
+
+@called_by_kernels
+def _is_outside(bound: np.ndarray, sides: np.ndarray) -> bool:
+    """Tell whether all of a batch lies beyond one side: a x + b y + c z + d + k longest < 0 in all of its box."""
+    for s in range(sides.shape[0]):
+        most = sides[s, 3] + sides[s, 4] * bound[LONGEST]
+        for axis in range(3):
+            slope = sides[s, axis]
+            most += slope * (bound[HIGH + axis] if slope > 0.0 else bound[LOW + axis])
+        if most < 0.0:
+            return True
+    return False
 
 
 @called_by_kernels(error_model="numpy", fastmath={"contract", "nnan", "ninf", "nsz"})
