@@ -6,6 +6,7 @@ import math
 from collections.abc import Callable, Sequence
 from itertools import takewhile
 from typing import Any
+from weakref import WeakKeyDictionary
 
 import viser
 
@@ -33,10 +34,12 @@ div:has(> div > .gsseg-columns) { display: grid; grid-template-columns: repeat(2
 div:has(> div > .gsseg-columns) > div { margin: 0 2px !important; padding: 0 0 3px !important }
 div:has(> div > .gsseg-columns) button { height: 20px !important; padding: 0 4px !important; font-size: 11px }
 div:has(> div > .gsseg-columns) .mantine-Button-inner { justify-content: start }
+@media (pointer: coarse) { div:has(> div > .gsseg-columns) button { height: 28px !important } }
 </style><i class="gsseg-columns"></i>"""
 """viser knows no columns. Where its page is built otherwise, the rows stand below each other."""
 
 Event = viser.GuiEvent[Any]
+Place = tuple[Camera, float, float]  # a column and a row in a camera's picture
 
 
 class Panel:
@@ -48,6 +51,7 @@ class Panel:
     def __init__(self, gui: viser.GuiApi, state: ViewerState, viewpoint: Viewpoint, live: bool) -> None:
         self._gui, self._state, self._viewpoint = gui, state, viewpoint
         self._rows: dict[int, tuple[ClassRow, viser.GuiButtonHandle]] = {}
+        self.clicked: WeakKeyDictionary[viser.ClientHandle, Place] = WeakKeyDictionary()  # where, last, in each browser
         gui.configure_theme(dark_mode=True, show_logo=False, show_share_button=False, control_width="medium")
         gui.set_panel_label("gsseg")
         self.answer = Answer(gui, state, self._show_level)
@@ -155,12 +159,16 @@ class Panel:
 
     def _build_correct(self) -> None:
         gui = self._gui
-        gui.add_markdown("**Shift + click** or **shift + drag** a box in the picture: what is there is")
+        gui.add_markdown(
+            "**Shift + click** or **shift + drag** a box in the picture, or click and press below: what is there is"
+        )
         self._target = gui.add_dropdown("class", self._target_names())
         self._new = gui.add_text("new class", "")
         self._on(gui.add_button("add the class", icon=viser.Icon.PLUS).on_click, lambda _: self._add_class())
         self._tool = gui.add_dropdown("a click means", (REGION, ALIKE, DISC))
         self._radius = gui.add_slider("disc, % of height", 0.5, 20.0, 0.5, 3.0)
+        there = gui.add_button("correct what was clicked last", icon=viser.Icon.POINTER)
+        self._on(there.on_click, self._correct_clicked)
         undo = gui.add_button("take the last one back", icon=viser.Icon.ARROW_BACK_UP)
         self._on(undo.on_click, lambda _: self._undo())
         self._corrected = gui.add_markdown("No corrections yet.")
@@ -246,6 +254,14 @@ class Panel:
         """Correct what is in a box between two corners, column and row in pixels of the camera."""
         with self._state.lock:
             self._correct(box(camera, corner, opposite, self._label()))
+
+    def _correct_clicked(self, event: Event) -> None:
+        place = None if event.client is None else self.clicked.get(event.client)
+        if place is None:
+            raise SettingsError(
+                "correction: nothing was clicked in this browser; expected a click in the picture first"
+            )
+        self.correct_at(*place)
 
     def _correct(self, drawn: View) -> None:
         changed = self._state.correct(drawn)

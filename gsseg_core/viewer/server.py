@@ -8,6 +8,8 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
+import functools
+import gzip
 import inspect
 import io
 import logging
@@ -38,6 +40,12 @@ _SOON = 0.02  # seconds until it is looked again whether the server is made
 
 _HEARD = ("ViewerCameraMessage", "ScenePointerMessage", "GuiUpdateMessage", "GetRenderResponseMessage")
 """What a page sends that the viewer has a use for. viser itself would also take files, and open itself to everybody."""
+
+_TAPS = b"""<script>addEventListener("pointerdown", (event) => {
+  const { target, pointerId } = event;
+  if (target.tagName === "CANVAS" && target.hasPointerCapture(pointerId)) target.releasePointerCapture(pointerId);
+}, true);</script>"""
+"""A browser gives a finger to what it touches from the beginning, and viser takes that for a drag of its own."""
 
 
 def _tells_more(record: logging.LogRecord) -> bool:
@@ -85,6 +93,7 @@ def _guarding(listener: Listener) -> Iterator[threading.Event]:
             response = process_request(connection, request)
             answer: Response | None = await response if inspect.isawaitable(response) else response
             if answer is not None:
+                _let_tap(answer)
                 answer.headers.update(listener.headers(*asked))
             return answer
 
@@ -99,6 +108,19 @@ def _guarding(listener: Listener) -> Iterator[threading.Event]:
     finally:
         websockets.asyncio.server.serve = real  # type: ignore[misc]
         over.set()
+
+
+def _let_tap(answer: Response) -> None:
+    """Have the page, if it is what is sent, tell of taps as of clicks."""
+    if answer.headers.get("Content-Type", "").startswith("text/html"):
+        answer.body = _with_taps(bytes(answer.body), answer.headers.get("Content-Encoding") == "gzip")
+        del answer.headers["Content-Length"]
+        answer.headers["Content-Length"] = str(len(answer.body))
+
+
+@functools.lru_cache(maxsize=2)
+def _with_taps(page: bytes, zipped: bool) -> bytes:
+    return gzip.compress(gzip.decompress(page) + _TAPS) if zipped else page + _TAPS
 
 
 def understood(data: Any) -> bool:

@@ -18,7 +18,7 @@ from gsseg_core.viewer.access import Listener, listen
 from gsseg_core.viewer.clients import AUTO, DRAWN_BY, ClientRenderers
 from gsseg_core.viewer.live_source import LiveSource
 from gsseg_core.viewer.model import ViewModel
-from gsseg_core.viewer.panel import Panel
+from gsseg_core.viewer.panel import Panel, Place
 from gsseg_core.viewer.picking import pick
 from gsseg_core.viewer.server import start_server
 from gsseg_core.viewer.state import ViewerState
@@ -80,6 +80,7 @@ class Viewer:
     def _on_click(self, event: viser.SceneClickEvent) -> None:
         state, asked = self.state, self.panel.answer.ask()
         with self.panel.answer.telling(event.client):
+            self.panel.clicked[event.client] = _place(event)
             picked = pick(
                 state.model.scene,
                 camera_of(event.client),
@@ -97,8 +98,7 @@ class Viewer:
 
     def _on_correction_click(self, event: viser.SceneClickEvent) -> None:
         with self.panel.answer.telling(event.client):
-            camera = camera_of(event.client, DRAWING_HEIGHT)
-            self.panel.correct_at(camera, *_pixel(camera, np.clip(event.screen_pos, 0, 1 - 1e-9)))
+            self.panel.correct_at(*_place(event))
 
     def _on_correction_box(self, event: viser.SceneRectSelectEvent) -> None:
         with self.panel.answer.telling(event.client):
@@ -128,6 +128,11 @@ class Viewer:
                     raise
                 self.panel.show_live(what)
                 self._closing.wait(1.0)
+
+
+def _place(event: viser.SceneClickEvent) -> Place:
+    camera = camera_of(event.client, DRAWING_HEIGHT)
+    return camera, *_pixel(camera, np.clip(event.screen_pos, 0, 1 - 1e-9))
 
 
 def _pixel(camera: Camera, place: Sequence[float] | np.ndarray) -> tuple[float, float]:

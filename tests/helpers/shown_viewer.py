@@ -71,9 +71,10 @@ class Shown:
 
 
 @contextmanager
-def on_a_page(viewer: Viewer, chromium: Browser) -> Iterator[Shown]:
+def on_a_page(viewer: Viewer, chromium: Browser, **options: Any) -> Iterator[Shown]:
+    """Show a viewer on a page; `options` are further ones of Playwright's contexts."""
     # three.js complains of the splats' own geometry, which is flat, wherever one points at it.
-    with closing(viewer), opened_page(chromium, 960, 640, tolerated="computeBoundingSphere") as page:
+    with closing(viewer), opened_page(chromium, 960, 640, "computeBoundingSphere", **options) as page:
         page.goto(viewer.url)
         shown = Shown(viewer, page)
         shown.wait(lambda: viewer.server.get_clients(), "the page")
