@@ -9,7 +9,7 @@ from __future__ import annotations
 import os
 import re
 import unicodedata
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path
 
 from gsseg_core.errors import ClassesFileError, GssegError, SettingsError
@@ -94,9 +94,9 @@ def flaw_of_view_name(name: str) -> str:
     return _flaw(name) or (f"{quoted(name)} of {size:,} bytes; {wanted}" if size > MAX_VIEW_NAME else "")
 
 
-def listed(names: Iterable[str], most: int = _LISTED) -> str:
-    """List names for a message: the first ones, and how many more there are."""
-    every = [clipped(name) for name in names]
+def listed(names: Iterable[str], most: int = _LISTED, written: Callable[[str], str] = clipped) -> str:
+    """List names for a message: the first ones, as they are `written`, and how many more there are."""
+    every = [written(name) for name in names]
     more = len(every) - most
     return ", ".join(every[:most]) + (f" and {more:,} more" if more > 0 else "")
 

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 
 import numpy as np
 
 from gsseg_core.data.class_names import NOTED, class_name, listed
 from gsseg_core.learn.mask_reliability import MaskChecker, ViewCheck, sum_cells
-from gsseg_core.text import counted
+from gsseg_core.text import clipped, counted
 
 RENAMED = 0.25  # share of an id's pixels from which on it is one of several; where ids hold, next to none are
 
@@ -50,9 +50,11 @@ def renamed_report(renamed: Mapping[int, int], class_names: Mapping[int, str]) -
     ]
 
 
-def renamed_note(renamed: Sequence[Mapping[str, str]], per_view: str, label_map: str) -> str:
+def renamed_note(
+    renamed: Sequence[Mapping[str, str]], per_view: str, label_map: str, written: Callable[[str], str] = clipped
+) -> str:
     """Say in a sentence without its stop what a `renamed_report` lists, and which two settings help; "" for nothing."""
-    pairs = listed((f"{entry['name']} ({entry['others_say']})" for entry in renamed), NOTED)
+    pairs = listed((f"{entry['name']} ({entry['others_say']})" for entry in renamed), NOTED, written)
     return bool(renamed) * (
         f"other views call {counted(len(renamed), 'id')} by another that no mask shows beside it: {pairs}. Did a "
         f"tracker lose objects and name them anew, or are there two names for one thing? {per_view} finds objects "

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
@@ -14,7 +14,7 @@ from gsseg_core.data.view import View
 from gsseg_core.learn.mask_reliability import ViewCheck, sum_cells
 from gsseg_core.learn.renamed_ids import renamed_note
 from gsseg_core.metrics import iou
-from gsseg_core.text import counted
+from gsseg_core.text import clipped, counted
 
 SHOWN = 1 / 2000  # of its checked pixels a class has at least in a view that shows it; less is an edge's blur
 TRUSTED = 0.7  # the page warns of masks with which the other views agree in a smaller share of their pixels, ...
@@ -101,15 +101,18 @@ def grey_ids_of(report: Mapping[str, Any]) -> str:
     )
 
 
-def renamed_ids_of(report: Mapping[str, Any]) -> str:
+def renamed_ids_of(report: Mapping[str, Any], written: Callable[[str], str] = clipped) -> str:
     """Say in a sentence without its stop which ids name objects that have another, and what to do; "" if none does."""
-    return renamed_note(report["views"].get("renamed", ()), "--ids per-view", "--label-map")
+    return renamed_note(report["views"].get("renamed", ()), "--ids per-view", "--label-map", written)
 
 
-def warnings_of(report: Mapping[str, Any], ious: np.ndarray | None) -> list[str]:
+def warnings_of(
+    report: Mapping[str, Any], ious: np.ndarray | None, written: Callable[[str], str] = clipped
+) -> list[str]:
     """Say in sentences what about a run should make its user look twice, what weighs most first.
 
-    `report` is what `report.json` holds; `ious` (K,) are those of the classes with the masks, NaN where there is none.
+    `report` is what `report.json` holds; `ious` (K,) are those of the classes with the masks, NaN where there is none;
+    names are `written` so.
     """
     views, gaussians = report["views"], report["gaussians"]
     warnings = [] if has_objects(report) else [f"No Gaussian is part of an object: {NO_OBJECTS}."]
@@ -127,26 +130,26 @@ def warnings_of(report: Mapping[str, Any], ious: np.ndarray | None) -> list[str]
         warnings.append(
             f"{len(doubtful)} of {len(views['reliability'])} {whose} with the other views in more than "
             f"{100 - round(100 * TRUSTED)} % of {'their' if len(doubtful) > 1 else 'its'} pixels: "
-            f"{listed((view['name'] for view in doubtful), NOTED)}. Wrong ids, a wrong pose, or a mask of another "
-            "image?"
+            f"{listed((view['name'] for view in doubtful), NOTED, written)}. Wrong ids, a wrong pose, or a mask "
+            "of another image?"
         )
-    if of_ids := grey_ids_of(report) or renamed_ids_of(report):
+    if of_ids := grey_ids_of(report) or renamed_ids_of(report, written):
         warnings.append(f"{of_ids[:1].upper()}{of_ids[1:]}.")
     names = dict(enumerate(entry["name"] for entry in report["classes"]))
     empty = [entry["name"] for entry in report["classes"] if entry["id"] and not entry["gaussians"]]
     if empty and report.get("ids"):
         warnings.append(
             f"{len(empty):,} of {counted(report['ids']['objects'], 'object')} that were found got no Gaussian, as "
-            f"other views give what their masks show to others: {listed(empty, NOTED)}."
+            f"other views give what their masks show to others: {listed(empty, NOTED, written)}."
         )
     elif empty:
-        warnings.append(f"{counted(len(empty), 'class', 'classes')} got no Gaussian: {listed(empty, NOTED)}.")
+        warnings.append(f"{counted(len(empty), 'class', 'classes')} got no Gaussian: {listed(empty, NOTED, written)}.")
     if ious is not None:
         weak = [names[k] for k in np.argsort(ious).tolist() if k in names and ious[k] < KNOWN_CLASS]
         if weak:
             warnings.append(
                 f"Of {counted(len(weak), 'class', 'classes')} masks and prediction overlap by less than half "
-                f"(IoU below {KNOWN_CLASS:g}): {listed(weak, NOTED)}."
+                f"(IoU below {KNOWN_CLASS:g}): {listed(weak, NOTED, written)}."
             )
     total = max(report["scene"]["gaussians"], 1)
     if gaussians["unobserved"] > 0.02 * total:

@@ -19,10 +19,11 @@ from gsseg_core.report import sections
 from gsseg_core.report.findings import warnings_of
 from gsseg_core.report.sections import PageInputs
 from gsseg_core.several_at_once import several_at_once
-from gsseg_core.text import counted, percent, printable
+from gsseg_core.text import clipped, counted, percent, printable
 
 if TYPE_CHECKING:
     from jinja2 import Environment
+    from markupsafe import Markup
 
 # Sections that are made beside each other, before the others, which choose views by what these have rendered.
 FIRST = ("preview", "views-shown")
@@ -38,6 +39,7 @@ SECTIONS: Mapping[str, tuple[str, Callable[[PageInputs], sections.Content | None
 }
 """Sections of the page by anchor: title, and what is handed to the macro of that name; None leaves the section out."""
 TEMPLATE = "page.html.j2"
+_BEGIN, _END = "\u2068", "\u2069"  # of a name in a sentence; a name itself holds neither, once it is printable
 
 
 def write_report_page(path: str | os.PathLike[str], run: PageInputs) -> None:
@@ -63,7 +65,7 @@ def report_page(run: PageInputs) -> str:
             report={"run": None, **report},
             name=os.path.basename(report["scene"]["path"]),
             confidence=float(run.segmentation.confidence[labelled].mean()) if labelled.any() else None,
-            warnings=warnings_of(report, run.ious),
+            warnings=[_isolated(one) for one in warnings_of(report, run.ious, _in_sentence)],
             sections=[(anchor, title, made[anchor]) for anchor, (title, _) in SECTIONS.items() if anchor in made],
             policy=policy,
             style=style,
@@ -104,6 +106,17 @@ def load_templates() -> None:
     """Compile the templates now, so that who writes a page later does not wait for that."""
     for name in (TEMPLATE, "sections.html.j2", "charts.html.j2"):  # each imports the next
         environment().get_template(name)
+
+
+def _in_sentence(name: str) -> str:
+    return f"{_BEGIN}{clipped(name)}{_END}"
+
+
+def _isolated(sentence: str) -> Markup:
+    """HTML of a sentence, in which names that are read from the right leave what is around them in order."""
+    from markupsafe import Markup, escape
+
+    return escape(sentence).replace(_BEGIN, Markup("<bdi>")).replace(_END, Markup("</bdi>"))
 
 
 def _hash(content: str) -> str:

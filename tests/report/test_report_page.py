@@ -55,6 +55,17 @@ def test_every_element_is_closed_and_every_picture_and_chart_is_described(outlin
     assert links == {f"#{section['id']}" for section in outline.tagged("section")}
 
 
+def test_names_that_are_read_from_the_right_leave_warnings_in_order(out: Path) -> None:
+    report, (result, _) = json.loads((out / "report.json").read_text()), segmented()
+    name = "\u05db\u05d9\u05e1\u05d0 \u2069</bdi>"
+    report["views"]["reliability"][0] |= {"name": name, "reliability": 0.1}
+    report["views"]["renamed"] = [{"name": name, "others_say": "cup"}]
+    page = report_page(PageInputs(report, SCENE, result, MaskChecks([], {}, False), ViewImages(SCENE)))
+    shown = "\u05db\u05d9\u05e1\u05d0 \\u2069&lt;/bdi&gt;"
+    assert f"of its pixels: <bdi>{shown}</bdi>. Wrong ids" in page
+    assert f"no mask shows beside it: <bdi>{shown} (cup)</bdi>. Did" in page
+
+
 def test_page_asks_for_nothing_from_elsewhere_and_may_not(outline: Outline, out: Path, text: str) -> None:
     for _, attributes in outline.elements:
         for name in ("src", "href", "action", "srcset", "poster"):
