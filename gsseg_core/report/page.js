@@ -1,12 +1,14 @@
 // The 3D preview of report.html: Gaussians as opaque elliptic discs, WebGL 2, no library.
 // Without WebGL 2 it leaves the page as it is, with a picture in the preview's place.
 "use strict";
+// Names that look alike are alike, though accents may be characters of their own, as macOS writes them.
+const plain = (text) => text.normalize("NFC").toLowerCase();
 for (const field of document.querySelectorAll(".search")) {
   field.hidden = false;
   field.addEventListener("input", () => {
-    const wanted = field.value.trim().toLowerCase();
+    const wanted = plain(field.value.trim());
     for (const row of document.querySelectorAll(field.dataset.rows)) {
-      row.hidden = ![...row.querySelectorAll("bdi")].some((name) => name.textContent.toLowerCase().includes(wanted));
+      row.hidden = ![...row.querySelectorAll("bdi")].some((name) => plain(name.textContent).includes(wanted));
     }
     const found = document.querySelectorAll(`${field.dataset.rows}:not([hidden], .elsewhere)`).length;
     field.nextElementSibling.textContent = wanted && `${found} found`;

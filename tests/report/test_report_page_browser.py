@@ -38,7 +38,7 @@ def report(tmp_path_factory: pytest.TempPathFactory) -> str:
 def long_report(tmp_path_factory: pytest.TempPathFactory) -> str:
     """Address of a page of more classes than fit on it one by one, some of them under very long names."""
     folder, (scene, truth) = tmp_path_factory.mktemp("long"), many_classes(24)
-    long = {4: "x" * 200, 5: "a thing on the table " * 9, 6: "\u05e9" * 9, 7: "object_007"}
+    long = {4: "x" * 200, 5: "a thing on the table " * 9, 6: "\u05e9" * 9, 7: "object_007", 8: "Tu\u0308r"}
     names = {k: f"class {k}" for k in range(24)} | NASTY | long
     cameras = [look_at(f"view{i}", np.array([0.1 * i, -0.9, 1.5]), 160, 120, 90.0) for i in range(4)]
     data = write_dataset(folder / "data", scene, truth, cameras, names)
@@ -178,6 +178,20 @@ def test_long_names_and_many_classes_break_no_figure_and_make_no_page_wider(
         assert page.evaluate(cut_off) == []
         whole = page.locator("th.name:has-text('object_007')").evaluate("name => name.scrollWidth <= name.clientWidth")
         assert whole, "the names that objects get are told apart by their end"
+
+
+def test_a_search_finds_letters_whose_accents_are_characters_of_their_own(page: Page, long_report: str) -> None:
+    page.goto(long_report)
+    page.locator("#classes .search").fill("t\u00fcr")
+    assert page.locator("#classes tbody tr:visible").count() == 1
+
+
+def test_a_tablet_shows_what_a_pointer_would_have_to_find(chromium: Browser, long_report: str) -> None:
+    with opened_page(chromium, 1024, 768, has_touch=True, is_mobile=True) as page:
+        page.goto(long_report)
+        page.wait_for_selector(f"{CANVAS}[data-frames]")
+        page.evaluate("document.querySelector('.legend').classList.add('many')")
+        assert page.locator(".only").first.evaluate("only => getComputedStyle(only).opacity") == "1"
 
 
 def test_keys_move_the_scene_and_leave_the_browser_its_own(opened: Page) -> None:
