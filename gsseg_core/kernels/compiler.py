@@ -21,7 +21,7 @@ F = TypeVar("F", bound=Callable[..., object])
 _njit: Any = numba.njit  # Its types know fewer options than it takes.
 _LESS: dict[str, Any] = {}
 _enable: Callable[[Dispatcher[Any]], None] = Dispatcher.enable_caching
-# Versions that were not tried compile and load in numba's own way, which takes longer.
+# Versions that were not tried compile and load in numba's own way, which takes longer and where Ctrl-C may crash.
 if numba.__version__.startswith("0.68."):
     from gsseg_core.kernels.loading import enable as _enable
     from gsseg_core.kernels.parts import KernelCompiler

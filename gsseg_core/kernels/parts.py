@@ -11,6 +11,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from functools import partial
 from typing import Any
 
 from llvmlite.ir import Module
@@ -19,6 +20,8 @@ from numba.core.compiler import CompilerBase, DefaultPassBuilder
 from numba.core.compiler_machinery import AnalysisPass, PassManager, register_pass
 from numba.core.typed_passes import IRLegalization
 from numba.parfors.parfor import Parfor
+
+from gsseg_core.kernels.returned import ReturningAPI
 
 _LOOP_WRAPPERS = {"_gufunc_wrapper", "parallel.gufunc.wrapper"}
 
@@ -104,5 +107,7 @@ class KernelCompiler(CompilerBase):
         codegen = self.state.targetctx.codegen()
         self.state.library = JITCodeLibrary(codegen, function.__qualname__)
         self.state.library.enable_object_caching()
+        context = self.state.targetctx  # of this compilation alone
+        context.get_python_api = partial(ReturningAPI, context)
         with taken_for(_PartsCodegen, codegen):
             return super().compile_extra(function)
