@@ -107,6 +107,29 @@ def test_where_there_is_no_memory_for_votes_no_view_is_listed(client: Any, monke
     assert_same(learner, taught(VoteLearner(SCENE, NUM_CLASSES), VIEWS))
 
 
+def test_views_that_cannot_all_be_replaced_stay_with_their_votes(client: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+    there, here = DistributedEM(client, SCENE, NUM_CLASSES, SETTINGS), EMLearner(SCENE, NUM_CLASSES, SETTINGS)
+    for learner in (there, here):
+        learner.observe_all(VIEWS[:4])
+        learner.fit()
+    others = [View.from_arrays(view.camera, VIEWS[0].read_labels()) for view in VIEWS[1:5]]
+    lift = DistributedEM._lift
+
+    def full(self: DistributedEM, view: View, *given: Any) -> bool:
+        if view.name == VIEWS[3].name:
+            raise MemoryError
+        return lift(self, view, *given)
+
+    with monkeypatch.context() as patch, pytest.raises(MemoryError):
+        patch.setattr(DistributedEM, "_lift", full)
+        there.observe_all(others)
+    assert [*there.views.values()] == VIEWS[:4] and there.error_models_.keys() == here.error_models_.keys()
+    assert_same(there, here)
+    for learner in (there, here):
+        learner.observe_all(others)
+    assert_same(there, here)
+
+
 def test_without_memory_for_prepared_views_the_result_is_the_same(client: Any) -> None:
     there = DistributedEM(client, SCENE, NUM_CLASSES, SETTINGS, memory_budget=0)
     there.observe_all(VIEWS)

@@ -72,9 +72,15 @@ class _OnWorkers(Learner):
         named = {view.name: view.held() for view in views}
         if named:
             votes, why = self._sum(dask_worker.sum_votes, named, lambda done: progress("observe", done, len(named)))
-            self._votes.add_rows(dask_worker.as_compiled_for(votes))  # First, as in `_add`.
-            for name, view in named.items():
-                self._add(view, UnusableViewError(why[name]) if why[name] else None)
+            before = {**vars(self), "views": dict(self.views), "rejected": dict(self.rejected)}
+            try:
+                self._votes = self._votes.copy()
+                self._votes.add_rows(dask_worker.as_compiled_for(votes))
+                for name, view in named.items():
+                    self._add(view, UnusableViewError(why[name]) if why[name] else None)
+            except BaseException:  # Too little memory for votes, or to take back those of a view that is replaced.
+                vars(self).update(before)
+                raise
         progress("observe", len(named), len(named))
 
     def _sum(
