@@ -6,6 +6,7 @@ through `paragraph` or `_isolated`, and into labels, which are text, only throug
 
 from __future__ import annotations
 
+import unicodedata
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 
@@ -22,6 +23,7 @@ MOST_CLASSES, MOST_VIEWS = 5, 8  # of the probabilities and votes that the answe
 LONGEST_NAME = 80  # characters of a name; of a longer one, the first
 NOTICE: float | None = 10.0  # seconds for which a browser is told of an error beside the answer; None: until closed
 _STYLE = "padding: 0 0.75em 0.75em; font-size: 0.875em; overflow-wrap: anywhere"
+_LEAST = 0.005  # of a probability that is named beside the largest one: less reads 0.00
 _ASK = "Click on something in the picture to ask what it is."
 
 
@@ -106,7 +108,9 @@ class Answer:
         i = picked.gaussian
         labels, shares, names, _ = model.labelling
         label, probabilities = int(labels[i]), shares.take(np.array([i])).dense(len(names))[0]
-        best = [k for k in np.argsort(-probabilities, kind="stable")[:MOST_CLASSES].tolist() if probabilities[k] > 0]
+        least = min(_LEAST, max(probabilities.max(), 1e-9))
+        ranked = np.argsort(-probabilities, kind="stable")[:MOST_CLASSES].tolist()
+        best = [k for k in ranked if probabilities[k] >= least]
         likely = ", ".join(f"{_isolated(model.name(k))} {probabilities[k]:.2f}" for k in best)
         lines = [
             f", class {model.ids()[label]}" if label >= 0 else "",
@@ -126,6 +130,12 @@ class Answer:
 def shown_name(name: str) -> str:
     """Make a name harmless, and short enough to be shown."""
     return printable(name[:LONGEST_NAME])
+
+
+def label_name(name: str) -> str:
+    """As `shown_name`; one that is read from the right leaves what stands beside it in a label, which is text."""
+    text = shown_name(name)
+    return f"\u2068{text}\u2069" if {"R", "AL"} & {*map(unicodedata.bidirectional, text)} else text
 
 
 def paragraph(*lines: str, title: str = "") -> str:

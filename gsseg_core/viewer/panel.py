@@ -16,8 +16,8 @@ from gsseg_core.errors import GssegError, SettingsError
 from gsseg_core.export.collision import KINDS
 from gsseg_core.scene.camera import Camera
 from gsseg_core.scene.scene_writers import SCENE_WRITERS
-from gsseg_core.text import counted, printable
-from gsseg_core.viewer.answer import LONGEST_NAME, Answer, paragraph, shown_name
+from gsseg_core.text import composed, counted, printable
+from gsseg_core.viewer.answer import LONGEST_NAME, Answer, label_name, paragraph, shown_name
 from gsseg_core.viewer.corrections import box, disc, looks_alike, region
 from gsseg_core.viewer.model import MODES, ClassRow, ViewModel
 from gsseg_core.viewer.picture import BANDS
@@ -196,7 +196,7 @@ class Panel:
         """List only the classes whose name has what is searched for."""
         with self._state.lock:
             for row, button in self._rows.values():
-                button.visible = self._search.value.strip().lower() in row.name.lower()
+                button.visible = composed(self._search.value.strip().lower()) in composed(row.name.lower())
 
     def _on(self, register: Callable[[Callable[[Any], None]], object], action: Callable[[Event], object]) -> None:
         """Have a widget call an action, `register` being its `on_click` or `on_update`; errors are told."""
@@ -292,9 +292,10 @@ class Panel:
                 _set(self._target, names[place] if place < len(names) else chosen)
 
     def _undo(self) -> None:
-        if self._state.undo():
-            count = len(self._state.corrections)
-            self._corrected.content = f"{counted(count, 'correction')} left." if count else "None left."
+        with self._state.lock:  # Another browser may correct meanwhile.
+            if self._state.undo():
+                count = len(self._state.corrections)
+                self._corrected.content = f"{counted(count, 'correction')} left." if count else "None left."
 
     def _target_names(self) -> tuple[str, ...]:
         """Names by class id, as they are shown."""
@@ -303,7 +304,7 @@ class Panel:
 
     def _view_text(self, view: View) -> str:
         trust = self._state.reliability.get(view.name, math.nan)
-        return shown_name(view.name) + ("" if math.isnan(trust) else f" ({100 * trust:.0f} % reliable)")
+        return label_name(view.name) + ("" if math.isnan(trust) else f" ({100 * trust:.0f} % reliable)")
 
 
 def _set(widget: Any, value: object) -> None:
@@ -339,7 +340,7 @@ def _distinct(texts: Sequence[str]) -> tuple[str, ...]:
 def _look(row: ClassRow) -> dict[str, Any]:
     """Label, color and icon of the button that switches a class."""
     return {
-        "label": f"{shown_name(row.name)}  {row.size:,}",
+        "label": f"{label_name(row.name)}  {row.size:,}",
         "color": row.color if row.shown else _OFF,
         "icon": viser.Icon.EYE if row.shown else viser.Icon.EYE_OFF,
     }

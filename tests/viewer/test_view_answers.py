@@ -81,6 +81,28 @@ def test_names_that_are_read_from_the_right_leave_numbers_beside_them_in_order()
         assert f"<bdi>view</bdi>: {name}, 2.5 px" in answer._answer.content
 
 
+def test_buttons_of_names_that_are_read_from_the_right_keep_their_numbers_and_are_found_by_composed_letters() -> None:
+    named = LEARNT._replace(class_names={0: "table", 1: "\u05db\u05d9\u05e1\u05d0", 2: "Tu\u0308r", 3: "box"})
+    with closing(Viewer(ViewModel(SCENE, named), listener=listen(port=PORT), draw=SERVER)) as opened:
+        panel = opened.panel
+        labels = {row.label: button.label for row, button in panel._rows.values()}
+        assert labels[1] == f"\u2068{named.class_names[1]}\u2069  60" and labels[3] == "box  60"
+        panel._search.value = "T\u00fcr"
+        panel._filter()
+        assert [row.label for row, button in panel._rows.values() if button.visible] == [2]
+
+
+def test_probabilities_that_read_as_nothing_are_not_listed_beside_the_largest() -> None:
+    shares = np.array([[0.99, 0.004, 0.006, 0.0]] * len(TRUTH), np.float32)
+    with closing(
+        Viewer(ViewModel(SCENE, labelled(LEARNT.labels, shares, dict(NAMES))), listener=listen(port=PORT), draw=SERVER)
+    ) as opened:
+        answer = opened.panel.answer
+        answer.show_picked(answer.ask(), Picked(IN_BALL, 0.5))
+        bdi = [f"<bdi>{NAMES[k]}</bdi>" for k in (0, 2)]
+        assert f"probabilities: {bdi[0]} 0.99, {bdi[1]} 0.01</div>" in answer._answer.content
+
+
 def test_an_earlier_click_says_nothing_any_more_once_a_later_one_is_answered(viewer: Viewer) -> None:
     answer = viewer.panel.answer
     first, second = answer.ask(), answer.ask()
