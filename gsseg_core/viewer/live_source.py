@@ -34,7 +34,7 @@ class LiveSource(Protocol):
         """
 
     def close(self) -> None:
-        """Let go of what it holds."""
+        """Let go of what it holds; a `wait` in another thread that lasts, as for a node that is gone, then raises."""
 
 
 def open_source(name: str, scene: GaussianScene) -> LiveSource:

@@ -25,6 +25,7 @@ from gsseg_core.viewer.state import ViewerState
 from gsseg_core.viewer.viewpoint import Viewpoint, camera_of
 
 DRAWING_HEIGHT = 480  # rows of the image in which a correction is drawn; finer than the Gaussians is of no use
+SOURCE_SECONDS = 1.0  # that a live source gets to come back at the end, before it is closed while it waits
 
 
 class Viewer:
@@ -69,9 +70,11 @@ class Viewer:
         self._closing.set()
         self.state.stale.set()
         for thread in self._threads:
-            thread.join()
+            thread.join(SOURCE_SECONDS)
         if self._source is not None:
             self._source.close()
+        for thread in self._threads:
+            thread.join()
         self.renderers.close()
         with contextlib.redirect_stdout(io.StringIO()):
             self.server.stop()
@@ -124,6 +127,8 @@ class Viewer:
                     self.state.replace(update.labelling)
                     self.panel.show_live(f"{counted(update.num_views, 'view')} so far")
             except Exception as error:
+                if self._closing.is_set():  # The source was closed while it waited.
+                    return
                 if (what := explained(error)) is None:
                     raise
                 self.panel.show_live(what)

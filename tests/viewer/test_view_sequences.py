@@ -28,9 +28,11 @@ from gsseg_core.scene.camera import Camera
 from gsseg_core.segmentation import Segmentation
 from gsseg_core.viewer import corrections as view_corrections
 from gsseg_core.viewer import state as view_state
+from gsseg_core.viewer import viewer as viewer_module
 from gsseg_core.viewer.access import listen
 from gsseg_core.viewer.clients import SERVER, ClientRenderers
 from gsseg_core.viewer.corrections import disc
+from gsseg_core.viewer.live_source import LiveUpdate
 from gsseg_core.viewer.model import ClassRow, Labelling, ViewModel
 from gsseg_core.viewer.server import start_server
 from gsseg_core.viewer.state import ViewerState
@@ -353,3 +355,24 @@ def test_a_page_that_is_still_open_connects_to_the_next_viewer_once_that_is_made
         finally:
             with redirect_stdout(StringIO()):
                 server.stop()
+
+
+def test_to_close_does_not_wait_for_the_answer_of_a_node_that_is_gone(monkeypatch: pytest.MonkeyPatch) -> None:
+    class Source:
+        """Waits until it is closed, and then raises what a closed connection does."""
+
+        def __init__(self) -> None:
+            self.asked, self.closed = threading.Event(), threading.Event()
+
+        def wait(self, timeout: float) -> LiveUpdate | None:
+            self.asked.set()
+            assert self.closed.wait(PATIENCE), "nobody closes it"
+            raise RuntimeError("it is closed")
+
+        def close(self) -> None:
+            self.closed.set()
+
+    monkeypatch.setattr(viewer_module, "SOURCE_SECONDS", 0.01)
+    source = Source()
+    with closing(Viewer(ViewModel(SCENE, LEARNT), source=source, listener=listen(port=18300), draw=SERVER)):
+        assert source.asked.wait(PATIENCE)
