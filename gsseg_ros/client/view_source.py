@@ -31,8 +31,11 @@ ANSWER_SECONDS = 30.0
 """How long a request, and the clouds that follow it, may take."""
 
 _PARAMETERS = ("scene_to_map.scale", "scene_to_map.translation", "scene_to_map.rotation")
-_CHANGING = ("views fused", "codes", "changes of the class probabilities")
-"""Values of the node's diagnostics that change with its class probabilities, and with nothing else: not by asking."""
+_CHANGING = ("views fused", "codes", "changes of the class probabilities", "views accepted")
+"""Values of the node's diagnostics that change with its class probabilities, and with nothing else: not by asking.
+
+The last is there while the node is active, so that one that answered NOT_ACTIVE is asked again then.
+"""
 
 
 class RosSource:

@@ -12,8 +12,9 @@ from builtin_interfaces.msg import Time
 from labellings import probabilities_of
 from patience import PATIENCE
 from ros_helpers import Ros, ros_fixture, wait_until  # noqa: F401
+from ros_node_here import node_here
 from sensor_msgs.msg import PointCloud2
-from small_scenes import NAMES, many_classes, write_dataset
+from small_scenes import NAMES, clean_views, many_classes, write_dataset
 from std_msgs.msg import Header
 
 from gsseg_core.errors import SettingsError, StateMismatchError
@@ -26,6 +27,7 @@ from gsseg_ros.client.view_source import RosSource, _Places
 from gsseg_ros.conversions import CloudArrays
 from gsseg_ros.errors import SegmentationError
 from gsseg_ros.frames import Similarity
+from gsseg_ros.node.diagnostics import diagnostic_array
 
 MOVED = {"scene_to_map.scale": 2.0, "scene_to_map.translation": [1.0, -2.0, 0.5]}
 
@@ -155,3 +157,23 @@ def test_when_the_node_has_forgotten_all_nothing_is_known_any_more() -> None:
     update = source.wait(0.1)
     assert update is not None and update.num_views == 0 and (update.labelling.labels == UNOBSERVED).all()
     assert source.wait(0.1) is None
+
+
+def test_a_node_that_was_not_active_is_asked_again_once_it_is(ros: Ros, tmp_path: Path) -> None:
+    write_dataset(tmp_path / "data")
+    with node_here(ros, {"scene_path": tmp_path / "data/scene.ply"}) as here:
+        here.fuse(clean_views(2))
+        node, scene = here.node, GaussianScene.load(tmp_path / "data/scene.ply")
+        node.trigger_deactivate()
+        source = source_of(scene, "", SegmentationError(2, "NOT_ACTIVE", "the node is not active"), Similarity())
+
+        def hear() -> None:
+            source._on_diagnostics(diagnostic_array("/gsseg", node.workspace, node.inputs, Time()))
+
+        hear()
+        assert source.wait(0.1) is None and source._said == source._shown
+        hear()
+        assert source._said == source._shown, "it is asked again and again"
+        node.trigger_activate()
+        hear()
+        assert source._said != source._shown
