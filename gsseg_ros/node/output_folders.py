@@ -55,8 +55,8 @@ def _remove_where_failed(name: str, parent: int, error: type[BaseException] | No
             os.rmdir(name, dir_fd=parent)
 
 
-def require_own_folder(out: Path, kind: str) -> None:
-    """Refuse a folder that holds anything but holds no results of this kind.
+def require_own_folder(out: Path, kind: str, scene: Path | None = None) -> None:
+    """Refuse a folder that holds anything but holds no results of this kind, or whose results the scene is one of.
 
     Raises `PathTakenError`, `WriteError`: it is such a folder, or cannot be looked into.
     """
@@ -76,6 +76,7 @@ def require_own_folder(out: Path, kind: str) -> None:
             f"{out}: holds {foreign[0][:60]!r}, and no results of gsseg {kind}; expected a folder that is new, "
             "empty, or holds such results"
         )
+    StagedRun(out, kind).keep_apart(filter(None, [scene]))
 
 
 @contextlib.contextmanager

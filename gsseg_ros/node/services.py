@@ -291,7 +291,8 @@ class Services:
         scene_format, collision = request.format or settings.export_format, request.collision or None
         check_format(scene_format)
         check_collision(collision)
-        require_own_folder(directory, "segment")  # Before the work, and again below.
+        scene = self.workspace.session.scene
+        require_own_folder(directory, "segment", scene.path)  # Before the work, and again below.
         self.workspace.placement.finish()  # Nothing exports anew once they have followed.
         with self.workspace.run("export") as run:
             selection, refine = self._select(request, run)

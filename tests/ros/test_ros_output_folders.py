@@ -103,11 +103,11 @@ def test_a_scene_that_is_a_file_of_an_earlier_export_is_not_replaced_by_the_next
     with staged_export(tmp_path / "new", tmp_path) as run:
         (run.folder / "cup.ply").write_text("a cup")
     scene = tmp_path / "new" / "cup.ply"
-    with (
-        pytest.raises(PathTakenError, match=f"{scene}: is read .* all other results in {tmp_path}/new; expected"),
-        staged_export(tmp_path / "new", tmp_path, scene),
-    ):
+    says = f"{scene}: is read .* all other results in {tmp_path}/new; expected"
+    with pytest.raises(PathTakenError, match=says), staged_export(tmp_path / "new", tmp_path, scene):
         pytest.fail("nothing is to be written")
+    with pytest.raises(PathTakenError, match=says):  # What the node asks before the work.
+        require_own_folder(tmp_path / "new", "segment", scene)
     assert scene.read_text() == "a cup"
     with staged_export(tmp_path / "other", tmp_path, scene) as run:
         (run.folder / "cup.ply").write_text("another")

@@ -183,3 +183,16 @@ def test_ids_that_a_tracker_gave_anew_are_said_once_in_the_log_and_in_diagnostic
         here.done("reset")
         assert verdict() == "fusing"
     assert lines == [line]
+
+
+def test_an_export_that_would_replace_the_nodes_own_scene_is_refused_before_the_work(
+    ros: Ros, parameters: dict[str, Any], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    with node_here(ros, parameters) as here:
+        here.fuse(clean_views(2))
+        _, file, *_ = here.done("export", directory="exported").files
+        here.done("load_scene", path=f"exported/{file}")
+        here.fuse(clean_views(2))
+        monkeypatch.setattr(here.node._requests, "_select", lambda *_: pytest.fail("it begins to work"))
+        answer = here.ask("export", directory="exported")
+        assert answer.error_code == answer.PATH_TAKEN and f"{file}: is read by gsseg segment" in answer.error_msg
