@@ -263,8 +263,9 @@ def test_learning_ends_with_an_error_where_the_node_was_killed_and_started_anew_
     with SegmentationClient(domain_id=ros.domain, find_timeout=PATIENCE) as client:
         client.wait_until_active(PATIENCE)
         running = learning_forever(client)
-        time.sleep(2.0)  # While it works, to be asked again does not disturb it.
-        assert not running.ended
+        (goal,) = client._learning  # While it works, to be asked again does not disturb it.
+        wait_until(lambda: len(goal._questions) > 20 or running.ended, "questions for the result")
+        assert not running.ended, running.error
         node.kill()
         start_node(ros, tmp_path)
         running.join()
