@@ -132,6 +132,7 @@ class ReplayNode(Node):
 
     def declare(self) -> dict[str, Any]:
         """Declare all parameters and return their values; raises `SettingsError` for a wrong type or range."""
+        values = {}
         for name, default, low, high, text in _PARAMETERS:
             descriptor = ParameterDescriptor(description=text, read_only=True)
             if low is not None and high is not None:
@@ -141,12 +142,13 @@ class ReplayNode(Node):
                     descriptor.floating_point_range = [FloatingPointRange(from_value=low, to_value=high, step=0.0)]
             try:
                 self.declare_parameter(name, default, descriptor)
+                values[name] = self.get_parameter(name).value  # An empty list, which has no type, is found here.
             except ParameterException as error:
                 limits = "" if low is None else f" from {low:g} to {high:g}"
                 kind = _KINDS[type(default)]
                 reason = " ".join(str(error).split())
                 raise SettingsError(f"parameter '{name}': {reason}; expected {kind}{limits}") from None
-        return {name: self.get_parameter(name).value for name, *_ in _PARAMETERS}
+        return values
 
     def replay(self, source: Source, rate: float, loop: int) -> None:
         """Publish all that the source holds, `rate` masks per second, `loop` times (0: until stopped)."""

@@ -126,6 +126,7 @@ def test_a_parameter_that_does_not_exist_cannot_be_set(robot: Robot) -> None:
     ("arguments", "why"),
     [
         ({"k": 0}, "k"),
+        ({"k": []}, "parameter k is an empty list; expected a value such as 50"),
         ({"max_views": 2.5}, "max_views"),
         ({"pose_source": "gps"}, "parameter pose_source is 'gps'; expected topic, odometry, tf"),
         ({"scene_to_map.rotation": [0.0, 0.0, 0.0, 0.0]}, "scene_to_map.rotation is all zeros"),

@@ -297,6 +297,7 @@ def test_a_bag_that_is_missing_broken_or_empty_is_one_error(ros: Ros, folder: Pa
         ({"data": "", "rate": 0.0}, "expected a number with a decimal point from 0.001 to 1000"),
         ({"data": "", "rate": float("nan")}, "parameter 'rate'"),
         ({"data": "", "rate": 10}, "parameter 'rate': Trying to set parameter 'rate' to '10' of type 'INTEGER'"),
+        ({"data": "", "rate": []}, "parameter 'rate': The parameter 'rate' is not initialized"),
         ({"data": "", "loop": -1}, "expected a whole number from 0 to "),
     ],
 )
