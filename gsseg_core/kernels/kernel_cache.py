@@ -22,7 +22,7 @@ NOT_WHOLE = (EOFError, pickle.UnpicklingError)
 REMEDY = "set NUMBA_CACHE_DIR to a folder that you can write to"
 
 
-if os.environ.get("XDG_CACHE_HOME") == "":
+if not os.path.isabs(os.environ.get("XDG_CACHE_HOME", "/")):
     # Not set, says its specification; numba would load kernels from the folder in which the user happens to be.
     del os.environ["XDG_CACHE_HOME"]
 
@@ -32,7 +32,9 @@ def candidates() -> list[str]:
     user = "~/Library/Caches" if sys.platform == "darwin" else os.environ.get("XDG_CACHE_HOME", "~/.cache")
     own = str(_PACKAGE / "__pycache__")
     chosen = filter(None, [os.environ.get("NUMBA_CACHE_DIR")])
-    return [*chosen, own, os.path.join(os.path.expanduser(user), "numba")]
+    known = os.path.join(os.path.expanduser(user), "numba")
+    # Of a user without a home, "~" stays, which numba takes for a folder where he happens to be.
+    return [*chosen, own, *filter(os.path.isabs, [known])]
 
 
 def writable(folder: str) -> bool:

@@ -98,12 +98,22 @@ def test_kernels_run_where_folders_or_files_of_the_cache_are_somebody_elses(
     assert done.stdout == "[0] 0\n", done.stderr
 
 
-def test_no_kernel_is_loaded_from_the_folder_in_which_the_user_happens_to_be(tmp_path: Path) -> None:
-    environment = {**os.environ, "HOME": str(tmp_path), "XDG_CACHE_HOME": ""}
+@pytest.mark.parametrize("unusable", ["", "relative", "~"])
+def test_no_kernel_is_loaded_from_the_folder_in_which_the_user_happens_to_be(tmp_path: Path, unusable: str) -> None:
+    environment = {**os.environ, "HOME": str(tmp_path), "XDG_CACHE_HOME": unusable}
     ours = "from gsseg_core.kernels import kernel_cache as k; print(k.candidates()[-1])"
     numbas = "from numba.misc.appdirs import AppDirs; print(AppDirs(appname='numba', appauthor=False).user_cache_dir)"
     done = run(environment, "-c", f"{ours}; {numbas}")
     assert done.stdout == 2 * f"{tmp_path}/.cache/numba\n", done.stderr
+
+
+@pytest.mark.parametrize("home", ["~", "here"])  # "~" is what is left of it for a user whom the system does not know
+def test_a_user_without_a_home_gets_no_folder_of_kernels_where_he_happens_to_be(
+    monkeypatch: pytest.MonkeyPatch, home: str
+) -> None:
+    monkeypatch.setenv("HOME", home)
+    monkeypatch.delenv("XDG_CACHE_HOME", raising=False)
+    assert all(map(os.path.isabs, kernel_cache.candidates()))
 
 
 def test_a_kernel_that_is_not_whole_on_the_disk_is_compiled_anew_and_kept(tmp_path: Path) -> None:
