@@ -56,15 +56,25 @@ def check_writable(path: str | os.PathLike[str]) -> None:
     """Raise at once what `write_atomically` would raise after the work, but for a full disk; writes nothing."""
     path = Path(path)
     try:
-        folder = _replaceable(path).parent
-        while not os.path.lexists(folder):
-            folder = folder.parent
-        if not folder.is_dir():
-            raise WriteError(f"{path}: cannot be written ({folder} is not a folder)")
-        if not os.access(folder, os.W_OK | os.X_OK):
-            raise WriteError(f"{path}: cannot be written (no permission to write into {folder})")
+        check_changeable(_replaceable(path), path)
     except OSError as error:
         raise WriteError(f"{path}: cannot be written ({error.strerror or error})") from error
+
+
+def check_changeable(target: Path, path: Path) -> None:
+    """Raise `WriteError`, naming `path`, if this user may neither make nor replace nor remove a file; or `OSError`."""
+    folder = target.parent
+    while not os.path.lexists(folder):
+        folder = folder.parent
+    if not folder.is_dir():
+        raise WriteError(f"{path}: cannot be written ({folder} is not a folder)")
+    if not os.access(folder, os.W_OK | os.X_OK):
+        raise WriteError(f"{path}: cannot be written (no permission to write into {folder})")
+    if not os.path.lexists(target):
+        return
+    # Where this bit is set, as for /tmp, everybody makes files, and changes the name of nobody else's.
+    if folder.stat().st_mode & stat.S_ISVTX and os.geteuid() not in (0, folder.stat().st_uid, target.lstat().st_uid):
+        raise WriteError(f"{path}: cannot be written (it is another user's, and {folder} leaves it to its owner)")
 
 
 def check_replaceable(path: Path, what: str, is_one: bool) -> None:

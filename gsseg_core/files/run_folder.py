@@ -33,7 +33,7 @@ from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 from gsseg_core.errors import GssegError, PathTakenError, WriteError
-from gsseg_core.files.atomic import remove_leftovers, sync_folder, try_lock
+from gsseg_core.files.atomic import check_changeable, remove_leftovers, sync_folder, try_lock
 from gsseg_core.files.run_manifest import FileRecord, Manifest, RunRecord
 
 RUN_FILE, COMMIT_FILE = ".gsseg-run.json", ".gsseg-commit.json"
@@ -118,11 +118,20 @@ class StagedRun:
     def claim(self, places: Iterable[str]) -> None:
         """Raise `PathTakenError` if a place that the run will write is taken by what no run of its kind wrote.
 
-        `WriteError` where that cannot be read, as where `out` is no folder any more.
+        `WriteError` where that cannot be read, as where `out` is no folder any more, and where this user may not change
+        a folder or a file of the last run of its kind.
         """
         manifest = self._before()
+        places = list(places)
         for place in places:
             _check_free(self.out, place, manifest, self._kind)
+        # What cannot be moved into its place, or out of it, would leave the folder between two runs, for everybody.
+        gone = (place for place in manifest.files(self._kind) if _lies_in(self.out, place))
+        try:
+            for place in sorted({RUN_FILE, *places, *gone}):
+                check_changeable(self.out / place, self.out / place)
+        except OSError as error:
+            raise _unwritable(self.out, error) from error
 
     def keep_apart(self, inputs: Iterable[str | os.PathLike[str]]) -> None:
         """Raise `PathTakenError` if what the run reads is the folder that it writes to, or goes with its last run."""
@@ -175,7 +184,7 @@ class StagedRun:
         """Leave nothing behind: not what was staged, nor a folder that was made for it and is empty."""
         try:
             commit = self.out / COMMIT_FILE
-            if os.path.lexists(commit) and Manifest.read(commit).staging == self._staging.name:
+            if os.path.lexists(commit) and _read_commit(commit).staging == self._staging.name:
                 settle(self.out)  # Something raised an error in the middle of the move, Ctrl-C for example.
             else:
                 shutil.rmtree(self._staging, ignore_errors=True)
@@ -191,7 +200,7 @@ def _finish(out: Path) -> None:
     """Move the files of the run that `.gsseg-commit.json` names, if it is there, to their places; `out` is locked."""
     if not os.path.lexists(out / COMMIT_FILE):
         return
-    manifest = Manifest.read(out / COMMIT_FILE)
+    manifest = _read_commit(out / COMMIT_FILE)
     if not STAGING.fullmatch(manifest.staging):
         raise WriteError(f"{out / COMMIT_FILE}: is damaged; expected it as gsseg wrote it, or nothing")
     staging, before, run_id = out / manifest.staging, manifest.before, manifest.staging.removeprefix(".gsseg-")
@@ -233,6 +242,16 @@ def _finish(out: Path) -> None:
             "next command of gsseg that reads or writes this folder moves them"
         ) from error
     shutil.rmtree(staging, ignore_errors=True)
+
+
+def _read_commit(path: Path) -> Manifest:
+    try:
+        return Manifest.read(path)
+    except OSError as error:
+        raise WriteError(
+            f"{path}: cannot be read ({error.strerror or error}), so a run that was cut short is not finished; "
+            "expected that who began it runs gsseg on this folder once more"
+        ) from error
 
 
 def _unwritable(out: Path, error: OSError) -> WriteError:

@@ -14,6 +14,7 @@ from pathlib import Path
 
 import pytest
 from clean_process import in_clean_process
+from nobody import become_nobody
 from patience import PATIENCE
 from test_atomic import small_files_only
 
@@ -256,6 +257,32 @@ def test_a_place_that_is_taken_is_refused_by_name_before_the_work(
                 (run.folder / name).parent.mkdir(parents=True, exist_ok=True)
                 (run.folder / name).write_text(run.id)
     assert sorted(path.name for path in tmp_path.iterdir()) == sorted({"elsewhere", place})
+
+
+@in_clean_process
+def test_what_another_user_lets_nobody_move_is_refused_before_the_work(tmp_path: Path) -> None:
+    is_root = os.geteuid() == 0
+    for name in ("shared", "sticky")[: 1 + is_root]:
+        write(tmp_path / name, FIRST)
+        (tmp_path / name).chmod(0o777 if name == "shared" else 0o1777)
+        (tmp_path / name / "classes").chmod(0o555 if name == "shared" else 0o777)
+    become_nobody(tmp_path)
+    said = {"shared": "shared/classes/1_cup.ply: .*no permission", "sticky": "sticky/.gsseg-run.json: .*another user"}
+    for name in ("shared", "sticky")[: 1 + is_root]:
+        before = contents(Path(name))
+        with pytest.raises(WriteError, match=said[name]), staged_run(name, "segment"):
+            raise AssertionError("the work began")
+        assert contents(Path(name)) == before and hidden(Path(name)) == [RUN_FILE]
+
+
+@in_clean_process
+def test_a_move_that_another_user_alone_can_read_of_is_one_clear_error(tmp_path: Path) -> None:
+    (tmp_path / COMMIT_FILE).touch(0o000)
+    become_nobody(tmp_path)
+    for work in (lambda: write(Path(), FIRST), lambda: settle(Path())):
+        with pytest.raises(WriteError, match=r"^.gsseg-commit.json: cannot be read \(Permission denied\)"):
+            work()
+    assert os.listdir() == [COMMIT_FILE]
 
 
 def test_a_folder_that_a_file_replaces_during_the_run_is_one_clear_error(tmp_path: Path) -> None:
