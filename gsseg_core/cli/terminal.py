@@ -16,13 +16,14 @@ from gsseg_core.text import one_line, printable
 def prepare() -> None:
     """Have both streams take whatever is printed: what their encoding lacks as escapes, and nowhere if they are closed.
 
-    A closed stream is opened anew, since a file that is opened later would get its number.
+    A closed stream is opened anew, and so is standard input, since a file that is opened later would get its number,
+    and what a library prints: each gets the lowest number that is free.
     """
-    for name in ("stdout", "stderr"):
+    for name in ("stdin", "stdout", "stderr"):
         stream = getattr(sys, name)
         if stream is None:
-            setattr(sys, name, open(os.devnull, "w"))  # noqa: SIM115
-        elif isinstance(stream, io.TextIOWrapper):
+            setattr(sys, name, open(os.devnull, "r" if name == "stdin" else "w"))  # noqa: SIM115
+        elif isinstance(stream, io.TextIOWrapper) and name != "stdin":
             stream.reconfigure(errors="backslashreplace")
 
 

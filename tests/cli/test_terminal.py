@@ -51,6 +51,17 @@ def full() -> Iterator[int]:
     os.close(device)
 
 
+@pytest.mark.parametrize("closed", ["<&- >&- 2>&-", "<&- 2>&-", "<&-", ">&- 2>&-"])
+def test_no_file_gets_the_number_of_a_stream_that_was_closed(tmp_path: Path, closed: str) -> None:
+    program = (
+        "import sys; from gsseg_core.cli import terminal; terminal.prepare(); "
+        "file = open(sys.argv[1], 'w'); file.write(str(file.fileno()))"
+    )
+    command = ["sh", "-c", f'exec "$@" {closed}', "sh", sys.executable, "-c", program, tmp_path / "number"]
+    assert subprocess.run(command, check=False).returncode == 0
+    assert int((tmp_path / "number").read_text()) > 2
+
+
 def test_a_name_that_the_terminal_cannot_show_is_escaped(scoring: list[str], tmp_path: Path) -> None:
     environment = {**os.environ, "LC_ALL": "C", "PYTHONIOENCODING": "ascii", "PYTHONUTF8": "0"}
     done = subprocess.run(scoring, capture_output=True, text=True, env=environment, check=False)
