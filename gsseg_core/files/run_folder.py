@@ -66,7 +66,7 @@ def staged_run(
         try:
             yield run
         except GssegError as error:  # Nobody knows the folder in which it was staged.
-            raise type(error)(str(error).replace(str(run.folder), str(run.out))) from error
+            raise type(error)(*(str(part).replace(str(run.folder), str(run.out)) for part in error.args)) from error
         run.commit()
     finally:
         run.close()

@@ -21,6 +21,7 @@ from test_atomic import small_files_only
 from gsseg_core.errors import PathTakenError, SettingsError, WriteError
 from gsseg_core.files import run_folder
 from gsseg_core.files.atomic import write_atomically
+from gsseg_core.files.json_files import write_json
 from gsseg_core.files.run_folder import COMMIT_FILE, RUN_FILE, settle, staged_run
 from gsseg_core.files.run_manifest import FileRecord, Manifest
 
@@ -140,6 +141,13 @@ def test_a_run_that_fails_leaves_everything_as_it_was(tmp_path: Path) -> None:
     with pytest.raises(KeyboardInterrupt), staged_run(tmp_path / "no" / "such", "segment"):
         raise KeyboardInterrupt
     assert not (tmp_path / "no").exists()
+
+
+def test_messages_name_files_by_their_places_however_their_folder_is_called(tmp_path: Path) -> None:
+    out = tmp_path / "two\nlines"
+    with pytest.raises(WriteError, match=r"/two\\nlines/a.npz: cannot be"), staged_run(out, "segment") as run:
+        (run.folder / "a.npz").mkdir()
+        write_json(run.folder / "a.npz", {})
 
 
 def test_results_under_a_manifest_that_says_nothing_of_the_run_before_are_replaced(tmp_path: Path) -> None:
