@@ -23,16 +23,17 @@ def write_atomically(path: str | os.PathLike[str]) -> Iterator[Path]:
 
     An earlier file at `path` stays whole until the new one is complete and on the disk. If the body raises anything,
     the temporary file is removed and the earlier one remains; after a kill, the next write or run in the same folder
-    removes it. A link to a file stays, and the file that it leads to is replaced. Parent folders are created. The
-    temporary file has the suffix of `path`, for writers that go by it.
+    removes it. A link to a file stays, and the file that it leads to is replaced. Parent folders are created, and
+    removed again if the body raises. The temporary file has the suffix of `path`, for writers that go by it.
 
     Raises `PathTakenError` where `path` is a folder, a device, a FIFO or a socket, and `WriteError` in place of any
     `OSError`: disk full, folder not writable.
     """
     path = Path(path)
-    temporary, lock = None, -1
+    temporary, lock, made = None, -1, list[Path]()
     try:
         target = _replaceable(path)
+        made = [folder for folder in target.parents if not folder.exists()]
         target.parent.mkdir(parents=True, exist_ok=True)
         remove_leftovers(target.parent)
         temporary, lock = _locked_file(target.parent, path.suffix)
@@ -50,6 +51,8 @@ def write_atomically(path: str | os.PathLike[str]) -> Iterator[Path]:
                 temporary.unlink(missing_ok=True)
             if lock >= 0:
                 os.close(lock)
+            for folder in made:  # Only those that are empty can be removed: after a success, none.
+                folder.rmdir()
 
 
 def check_writable(path: str | os.PathLike[str]) -> None:
@@ -109,7 +112,9 @@ def sync_folder(folder: Path) -> None:
 
 def remove_leftovers(folder: Path) -> None:
     """Remove temporary files in a folder whose writers are dead."""
-    with os.scandir(folder) as entries:
+    names = list[str]()
+    # Some let everybody put files into a folder, and nobody see what is there.
+    with contextlib.suppress(PermissionError), os.scandir(folder) as entries:
         names = [entry.path for entry in entries if _TEMPORARY.fullmatch(entry.name)]
     for name in names:
         with contextlib.suppress(OSError), open(name, "rb") as file:

@@ -12,6 +12,7 @@ from pathlib import Path
 
 import pytest
 from clean_process import in_clean_process
+from nobody import become_nobody
 
 from gsseg_core.errors import GssegError, PathTakenError, SettingsError, WriteError
 from gsseg_core.files.atomic import check_writable, write_atomically
@@ -71,6 +72,25 @@ def test_a_full_disk_is_one_clear_error_and_leaves_the_earlier_file_whole(tmp_pa
     assert isinstance(caught.value, GssegError)
     assert path.read_text() == "earlier"
     assert list(tmp_path.iterdir()) == [path]
+
+
+def test_a_write_that_fails_leaves_no_folder_that_was_made_for_it(tmp_path: Path) -> None:
+    (tmp_path / "mine").mkdir()
+    for place in ("new/folder/a.ply", "mine/a.ply"):
+        with pytest.raises(WriteError, match=r"a\.ply: cannot be written"), write_atomically(tmp_path / place):
+            raise OSError
+    assert [path.name for path in tmp_path.rglob("*")] == ["mine"]
+
+
+@in_clean_process
+def test_a_folder_that_takes_files_and_shows_none_gets_one(tmp_path: Path) -> None:
+    (tmp_path / "letters").mkdir()
+    (tmp_path / "letters").chmod(0o333)
+    become_nobody(tmp_path)
+    check_writable("letters/a.json")
+    with write_atomically("letters/a.json") as temporary:
+        temporary.write_text("new")
+    assert Path("letters/a.json").read_text() == "new"
 
 
 def test_a_folder_that_cannot_be_made_is_one_clear_error(tmp_path: Path) -> None:
