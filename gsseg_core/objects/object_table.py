@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import asdict, dataclass, replace
 from typing import Any
 
@@ -94,8 +95,7 @@ class ObjectTable:
         Returns what `relabelled` does. Takes and raises what `add` does, and raises where there are too many objects;
         then nothing has changed.
         """
-        undo = self.checkpoint()
-        try:
+        with self._all_or_nothing():
             if not self.add(view, operator):
                 return _without_labels(view)
             lifted = self._lifted[view.name]
@@ -107,9 +107,6 @@ class ObjectTable:
                 raise UnknownLabelError(f"view '{view.name}': shows object {best.max()}; expected at most {MAX_LABEL}")
             self._give(view.name, best)
             return self.relabelled(view)
-        except BaseException:  # Too little memory for views of very many segments, too.
-            undo()
-            raise
 
     def checkpoint(self) -> Callable[[], None]:
         """Return what goes back to the present state, after `add`, `match`, `remove` or `solve`; not after `forget`."""
@@ -122,6 +119,16 @@ class ObjectTable:
             self._largest, self._agreement, self._forgotten = others
 
         return undo
+
+    @contextmanager
+    def _all_or_nothing(self) -> Iterator[None]:
+        """Go back to where it was if the body raises: too little memory for very many segments, or Ctrl-C."""
+        undo = self.checkpoint()
+        try:
+            yield
+        except BaseException:
+            undo()
+            raise
 
     def adopt(self, view: View) -> Observation | None:
         """Add a view whose ids are the numbers of objects already; returns it lifted, None where `add` tells False."""
@@ -161,10 +168,11 @@ class ObjectTable:
     def remove(self, name: str) -> None:
         """Take a view back, with all its evidence; raises `SettingsError` where there is no such view."""
         self._require(name)
-        del self.views[name]
-        self._lifted.pop(name, None)
-        if self._objects.pop(name, None) is not None:
-            self._fill()
+        with self._all_or_nothing():
+            del self.views[name]
+            self._lifted.pop(name, None)
+            if self._objects.pop(name, None) is not None:
+                self._fill()
 
     def sees(self, name: str) -> bool:
         """Whether a view counts: it was not set aside."""
@@ -194,14 +202,15 @@ class ObjectTable:
         Objects that have a number keep it, by the largest overlap; new ones follow, the largest first.
         """
         progress("associate", 0, 1)
-        solved, self._agreement = associate(self._lifted, self.settings)
-        before, successors = self._objects, np.arange(self._largest + 1)
-        if before:
-            solved, successors = self._renumbered(solved)
-        self._objects = solved
-        self._largest = max([self._largest, *(int(objects.max(initial=0)) for objects in solved.values())])
-        self._forgotten = self._forgotten.renumbered(successors)
-        self._fill()
+        with self._all_or_nothing():
+            solved, self._agreement = associate(self._lifted, self.settings)
+            before, successors = self._objects, np.arange(self._largest + 1)
+            if before:
+                solved, successors = self._renumbered(solved)
+            self._objects = solved
+            self._largest = max([self._largest, *(int(objects.max(initial=0)) for objects in solved.values())])
+            self._forgotten = self._forgotten.renumbered(successors)
+            self._fill()
         progress("associate", 1, 1)
         changed = [name for name in solved if name not in before or (before[name] != solved[name]).any()]
         return Repair(changed, successors)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
@@ -32,7 +33,7 @@ from gsseg_core.data.view import View
 from gsseg_core.errors import SceneValueError, SettingsError
 from gsseg_core.learn.em.em_learner import EMLearner
 from gsseg_core.objects.association import AssociationSettings, associate
-from gsseg_core.objects.lifted_segments import Lifted
+from gsseg_core.objects.lifted_segments import Lifted, Profiles
 from gsseg_core.objects.object_table import ObjectTable, find_objects, object_name
 from gsseg_core.raster.backends import make_operator
 from gsseg_core.scene.gaussian_scene import GaussianScene
@@ -124,6 +125,25 @@ def test_undoing_a_solve_brings_back_all_that_the_table_said_before() -> None:
     assert table.summary(nothing)["granularity"] is not None
     undo()
     assert table.summary(nothing) == before
+
+
+@pytest.mark.parametrize("change", [lambda table: table.remove(VIEWS[0].name), ObjectTable.solve])
+def test_a_change_that_is_interrupted_leaves_the_table_as_it_was(
+    change: Callable[[ObjectTable], object], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def interrupted(*_: object) -> None:
+        raise KeyboardInterrupt
+
+    table, untouched = ObjectTable(SCENE), ObjectTable(SCENE)
+    for view in VIEWS[:3]:
+        table.match(shuffled(view))
+        untouched.match(shuffled(view))
+    with monkeypatch.context() as patch, pytest.raises(KeyboardInterrupt):
+        patch.setattr(Profiles, "add", interrupted)
+        change(table)
+    nothing = Segmentation.from_codes(SCENE, np.zeros((len(SCENE), 4), np.float32), table.class_names)
+    assert table.summary(nothing) == untouched.summary(nothing)
+    np.testing.assert_array_equal(*(each.match(shuffled(VIEWS[3])).read_labels() for each in (table, untouched)))
 
 
 def test_clutter_that_one_view_shows_goes_to_the_background() -> None:
