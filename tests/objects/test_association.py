@@ -320,9 +320,9 @@ def test_objects_that_end_without_a_gaussian_are_listed_apart_and_ids_stay(
         report = json.loads((tmp_path / "out/report.json").read_text())
         assert [one["id"] for one in report["classes"]] == [0, 1, 2, 3]
         assert report["ids"]["objects"] == 3 and report["ids"]["without_gaussians"] == [4, 5]
-        page = (tmp_path / "out/report.html").read_text()
-        assert "<bdi>object_003</bdi>" in page and "<bdi>object_004</bdi>" not in page
-        assert "got no Gaussian" in page
+        warnings, _, sections = (tmp_path / "out/report.html").read_text().partition("<main>")
+        assert "<bdi>object_003</bdi>" in sections and "<bdi>object_004</bdi>" not in sections
+        assert "got no Gaussian" in warnings and "<bdi>object_004</bdi>, <bdi>object_005</bdi>." in warnings
         with np.load(tmp_path / "out/segmentation.npz") as file:
             assert file["class_ids"].tolist() == [0, 1, 2, 3, 4, 5]
 
