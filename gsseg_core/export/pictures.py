@@ -20,6 +20,10 @@ PAPER, INK, FAINT_INK = (255, 255, 255), (32, 34, 38), (128, 131, 138)
 FILL = 0.55  # share of a label's colour in an overlaid pixel
 CELL_PX = 480  # longest side of the pictures of a contact sheet, which is looked at as a whole
 LEGEND_ROWS = 24  # lines in a column of a legend, at most, unless it would become wider than high
+_SEEN_WITHOUT = (  # What who lacks red, or green, sees of linear RGB: Machado et al. 2009, severity 1.
+    ((0.152286, 1.052583, -0.204868), (0.114503, 0.786281, 0.099216), (-0.003882, -0.048116, 1.051998)),
+    ((0.367322, 0.860646, -0.227968), (0.280085, 0.672501, 0.047413), (-0.011820, 0.042940, 0.968881)),
+)
 _LONGEST = 400  # characters of a name that are drawn at most; no picture is wide enough for more
 
 
@@ -28,20 +32,21 @@ def palette(num_classes: int) -> np.ndarray:
     """Colours for K labels, as different from each other as they can be: (K, 3) uint8, read-only.
 
     Row 0 is `BACKGROUND`. Every other colour is the one of a fixed set that lies farthest, in OKLab, from all
-    earlier ones, so the colours of a smaller palette are the first ones of a larger one. Beyond about 1,500 classes
-    they start to repeat.
+    earlier ones, so the colours of a smaller palette are the first ones of a larger one. Eyes that lack red or green
+    are to tell them apart, too: how far two lie from each other is the least of the distances that such eyes see, each
+    trebled, and of that to others. Beyond about 1,500 classes they start to repeat.
     """
     levels = np.arange(15, 256, 16)
     candidates = np.stack(np.meshgrid(levels, levels, levels, indexing="ij"), axis=-1).reshape(-1, 3)
-    lab = _oklab(candidates)
-    chroma = np.hypot(lab[:, 1], lab[:, 2])
-    pleasant = (lab[:, 0] > 0.5) & (lab[:, 0] < 0.9) & (chroma > 0.07) & (chroma < 0.21)
-    candidates, lab = candidates[pleasant], lab[pleasant]
+    looks = _looks(candidates)
+    light, chroma = looks[0, 0], np.hypot(looks[0, 1], looks[0, 2])
+    pleasant = (light > 0.5) & (light < 0.9) & (chroma > 0.07) & (chroma < 0.21)
+    candidates, looks = candidates[pleasant], looks[..., pleasant]
 
     chosen = [int(np.argmin(np.abs(candidates - np.array([79, 143, 239])).sum(axis=1)))]  # a clear blue first
-    distance = np.linalg.norm(lab - _oklab(np.array([BACKGROUND])), axis=1)
+    distance = _distance(looks, _looks(np.array([BACKGROUND])))
     while len(chosen) < min(num_classes - 1, len(candidates)):
-        distance = np.minimum(distance, np.linalg.norm(lab - lab[chosen[-1]], axis=1))
+        distance = np.minimum(distance, _distance(looks, looks[..., chosen[-1:]]))
         chosen.append(int(np.argmax(distance)))
     colors = np.empty((num_classes, 3), np.uint8)
     colors[:1] = BACKGROUND
@@ -198,10 +203,22 @@ def _shorten(text: str, font: ImageFont.FreeTypeFont | ImageFont.ImageFont, widt
     return text + "..."
 
 
-def _oklab(rgb: np.ndarray) -> np.ndarray:
-    """(M, 3) uint8-ranged sRGB to OKLab (lightness, green-red, blue-yellow), by Ottosson's published matrices."""
+def _looks(rgb: np.ndarray) -> np.ndarray:
+    """How colours (M, 3) of 0 to 255 look: (3, 3, M) OKLab, to most eyes, and trebled, to eyes without red or green."""
     share = rgb / 255.0
     linear = np.where(share <= 0.04045, share / 12.92, ((share + 0.055) / 1.055) ** 2.4)
+    lacking = [3 * _oklab(np.clip(linear @ np.transpose(seen), 0, 1)).T for seen in _SEEN_WITHOUT]
+    return np.array([_oklab(linear).T, *lacking])
+
+
+def _distance(looks: np.ndarray, other: np.ndarray) -> np.ndarray:
+    """Square of how far colours are from another, (M,): the least of what the three kinds of eyes see."""
+    gap = looks - other
+    return np.asarray(np.einsum("ecm,ecm->em", gap, gap).min(axis=0))
+
+
+def _oklab(linear: np.ndarray) -> np.ndarray:
+    """Linear RGB (M, 3), 0 to 1, to OKLab (lightness, green-red, blue-yellow), by Ottosson's published matrices."""
     to_cones = np.array(
         [[0.4122214708, 0.5363325363, 0.0514459929], [0.2119034982, 0.6806995451, 0.1073969566],
          [0.0883024619, 0.2817188376, 0.6299787005]]

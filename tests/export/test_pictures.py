@@ -43,6 +43,16 @@ def test_colours_of_few_classes_are_far_apart() -> None:
     assert distances.min() > 40
 
 
+@pytest.mark.parametrize(("red", "blue"), [(0.11238, 0.00401), (0.29275, -0.02234)])
+def test_colours_of_few_classes_are_far_apart_for_eyes_that_lack_red_or_green(red: float, blue: float) -> None:
+    """By another model than the one they were chosen by: Vienot, Brettel and Mollon 1999."""
+    r, g, b = ((palette(17) / 255) ** 2.2).T
+    alike = red * r + (1 - red) * g
+    seen = 255 * np.clip([alike, alike, blue * (r - g) + b], 0, 1).T ** (1 / 2.2)
+    distances = np.linalg.norm(seen[:, None] - seen, axis=-1) + 1e3 * np.eye(17)
+    assert distances[:8, :8].min() > 40 and distances.min() > 20
+
+
 def test_more_classes_than_colours_still_get_one_each() -> None:
     assert palette(5000).shape == (5000, 3)
 
