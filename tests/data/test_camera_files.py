@@ -131,9 +131,9 @@ def test_where_no_size_is_given_the_images_are_asked(tmp_path: Path, file: str, 
     (camera,) = read_cameras(tmp_path)
     assert (camera.name, camera.image_size) == ("0001", (WIDTH, HEIGHT))
     assert_lands(camera, 32 + 25, 24 + 12.5)
+    (tmp_path / "train" / file).rename(tmp_path.parent / file)
+    (tmp_path / "train" / file).symlink_to(tmp_path.parent / file)
     with pytest.raises(PathNotAllowedError, match=file):
-        (tmp_path / "train" / file).rename(tmp_path.parent / file)
-        (tmp_path / "train" / file).symlink_to(tmp_path.parent / file)
         read_cameras(tmp_path, within=tmp_path)
 
 
