@@ -39,9 +39,9 @@ def sort_keys(keys: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         moved = np.empty_like(pairs)
         _move(pairs, shift, place, moved)
         pairs = moved
-    order = np.empty(len(keys), np.int32)
-    _part(pairs, least, order, moved_keys := np.empty_like(keys))
-    return order, moved_keys
+    order, ordered = np.empty(len(keys), np.int32), np.empty_like(keys)
+    _part(pairs, least, order, ordered)
+    return order, ordered
 
 
 @kernel(parallel=True)

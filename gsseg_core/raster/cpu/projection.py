@@ -87,6 +87,10 @@ class _Splats(NamedTuple):
     log_opacities: np.ndarray  # (N,)
 
 
+Side = tuple[float, float, float, float, float]
+"""A plane in the world, a x + b y + c z + d, and how much farther in a Gaussian reaches for each unit of its length."""
+
+_CONTRACTED = {"contract", "nnan", "ninf", "nsz"}
 _BOUNDS: PerScene[np.ndarray] = PerScene()
 
 
@@ -179,8 +183,9 @@ def _project(
     table: np.ndarray, depth: np.ndarray, ids: np.ndarray,  # (N, 8), (N,), (N,) out, where each chunk's part begins
 ) -> np.ndarray:  # fmt: skip
     """Project what is visible; returns how many Gaussians of each chunk that are, (CHUNKS,)."""
-    count, found, sides = splats.means.shape[0], np.zeros(CHUNKS, np.int64), _sides(lens)
+    count, found = splats.means.shape[0], np.zeros(CHUNKS, np.int64)
     for chunk in nb.prange(CHUNKS):
+        sides = _sides(lens)
         first, last = chunk * bounds.shape[0] // CHUNKS, (chunk + 1) * bounds.shape[0] // CHUNKS
         near, shown, who = np.empty(BATCH, np.bool_), np.empty(BATCH, np.bool_), np.empty(BATCH, np.int64)
         lanes = np.empty(NUMBERS * BATCH, np.float64)
@@ -189,7 +194,7 @@ def _project(
             if _is_outside(bounds[batch], sides):
                 continue
             begin, end = batch * BATCH, min((batch + 1) * BATCH, count)
-            _find_near(splats.means[begin:end], splats.scales[begin:end], splats.log_opacities[begin:end], lens, near)
+            _find_near(splats.means[begin:end], splats.scales[begin:end], splats.log_opacities[begin:end], sides, near)
             close = _collect(begin, near[: end - begin], splats, who, lanes)
             _project_near(close, lanes, shown, lens)
             for j in range(close):  # without a branch: what is not shown is overwritten
@@ -202,66 +207,68 @@ def _project(
 
 
 @called_by_kernels
-def _sides(lens: Pinhole) -> np.ndarray:
-    """Give the sides of what a camera sees, (5, 5) float64: a, b, c, d and k of each, for `_is_outside`.
-
-    They are those of `_find_near`, with z above half of NEAR, so that rounding throws nothing out.
-    """
-    pose, sides = lens.viewmat, np.empty((5, 5), np.float64)
-    for column in range(4):
-        z = pose[2, column]
-        near = ROOT * LARGEST_REACH * z
-        u = lens.K[0, 0] * pose[0, column] + lens.K[0, 2] * z
-        v = lens.K[1, 1] * pose[1, column] + lens.K[1, 2] * z
-        sides[0, column], sides[1, column], sides[2, column] = z, near + u, near + lens.width * z - u
-        sides[3, column], sides[4, column] = near + v, near + lens.height * z - v
-    sides[0, 3] -= 0.5 * NEAR
-    sides[0, 4] = 0.0
-    sides[1:3, 4] = LARGEST_REACH * lens.K[0, 0] * (1.0 + max(abs(lens.x_low), abs(lens.x_high)))
-    sides[3:, 4] = LARGEST_REACH * lens.K[1, 1] * (1.0 + max(abs(lens.y_low), abs(lens.y_high)))
-    return sides
-
-
-@called_by_kernels
-def _is_outside(bound: np.ndarray, sides: np.ndarray) -> bool:
-    """Tell whether all of a batch lies beyond one side: a x + b y + c z + d + k longest < 0 in all of its box."""
-    for s in range(sides.shape[0]):
-        most = sides[s, 3] + sides[s, 4] * bound[LONGEST]
-        for axis in range(3):
-            slope = sides[s, axis]
-            most += slope * (bound[HIGH + axis] if slope > 0.0 else bound[LOW + axis])
-        if most < 0.0:
-            return True
-    return False
-
-
-@called_by_kernels(error_model="numpy", fastmath={"contract", "nnan", "ninf", "nsz"})
-def _find_near(
-    means: np.ndarray, scales: np.ndarray, log_opacities: np.ndarray,  # (B, 3), (B, 3), (B,)
-    lens: Pinhole, near: np.ndarray,  # (BATCH,) bool out
-) -> None:  # fmt: skip
-    """Throw out most of what is off the image before the costly part, by instructions for several Gaussians at once.
+def _sides(lens: Pinhole) -> tuple[Side, Side, Side, Side, Side]:
+    """Give the sides of what a camera sees, that of depth first: who is beyond one is not seen, by `_within`.
 
     The reach is bounded by the longest axis and opacity 1, with sqrt(a^2 + b^2) <= |a| + |b|, twice, and with the
     outermost ray at which the camera is linearised. All is multiplied by depth, so nothing is divided.
     """
-    pose, fx, fy, cx, cy = lens.viewmat, lens.K[0, 0], lens.K[1, 1], lens.K[0, 2], lens.K[1, 2]
-    r00, r01, r02, tx = pose[0, 0], pose[0, 1], pose[0, 2], pose[0, 3]
-    r10, r11, r12, ty = pose[1, 0], pose[1, 1], pose[1, 2], pose[1, 3]
-    r20, r21, r22, tz = pose[2, 0], pose[2, 1], pose[2, 2], pose[2, 3]
-    width, height = lens.width, lens.height
-    across = fx * (1.0 + max(abs(lens.x_low), abs(lens.x_high)))
-    down = fy * (1.0 + max(abs(lens.y_low), abs(lens.y_high)))
+    fx, fy, cx, cy = lens.K[0, 0], lens.K[1, 1], lens.K[0, 2], lens.K[1, 2]
+    across = LARGEST_REACH * fx * (1.0 + max(abs(lens.x_low), abs(lens.x_high)))
+    down = LARGEST_REACH * fy * (1.0 + max(abs(lens.y_low), abs(lens.y_high)))
+    margin = LARGEST_REACH * ROOT
+    return (
+        _side(lens.viewmat, 0.0, 0.0, 1.0, 0.0),
+        _side(lens.viewmat, fx, 0.0, cx + margin, across),
+        _side(lens.viewmat, -fx, 0.0, lens.width - cx + margin, across),
+        _side(lens.viewmat, 0.0, fy, cy + margin, down),
+        _side(lens.viewmat, 0.0, -fy, lens.height - cy + margin, down),
+    )
+
+
+@called_by_kernels
+def _side(pose: np.ndarray, x: float, y: float, z: float, reach: float) -> Side:
+    """Take a side from the camera's axes to those of the world."""
+    return (
+        x * pose[0, 0] + y * pose[1, 0] + z * pose[2, 0],
+        x * pose[0, 1] + y * pose[1, 1] + z * pose[2, 1],
+        x * pose[0, 2] + y * pose[1, 2] + z * pose[2, 2],
+        x * pose[0, 3] + y * pose[1, 3] + z * pose[2, 3],
+        reach,
+    )
+
+
+@called_by_kernels(error_model="numpy", fastmath=_CONTRACTED)
+def _within(side: Side, x: float, y: float, z: float, longest: float) -> float:
+    """Tell how far a Gaussian may reach to the inner side, in px times depth; below 0 it lies beyond."""
+    return side[0] * x + side[1] * y + side[2] * z + side[3] + side[4] * longest
+
+
+@called_by_kernels(error_model="numpy", fastmath=_CONTRACTED)
+def _is_outside(bound: np.ndarray, sides: tuple[Side, ...]) -> bool:
+    """Tell whether all of a batch lies beyond one side, by the corner of its box that is farthest within."""
+    for side in sides:
+        x = bound[HIGH if side[0] > 0.0 else LOW]
+        y = bound[1 + (HIGH if side[1] > 0.0 else LOW)]
+        z = bound[2 + (HIGH if side[2] > 0.0 else LOW)]
+        if _within(side, np.float64(x), np.float64(y), np.float64(z), np.float64(bound[LONGEST])) < 0.0:
+            return True
+    return False
+
+
+@called_by_kernels(error_model="numpy", fastmath=_CONTRACTED)
+def _find_near(
+    means: np.ndarray, scales: np.ndarray, log_opacities: np.ndarray,  # (B, 3), (B, 3), (B,)
+    sides: tuple[Side, ...], near: np.ndarray,  # (BATCH,) bool out
+) -> None:  # fmt: skip
+    """Throw out most of what is off the image before the costly part, by instructions for several Gaussians at once."""
+    depth, left, right, top, bottom = sides
     for i in range(means.shape[0]):
-        mx, my, mz = np.float64(means[i, 0]), np.float64(means[i, 1]), np.float64(means[i, 2])
-        z = r20 * mx + r21 * my + r22 * mz + tz
-        u = fx * (r00 * mx + r01 * my + r02 * mz + tx) + cx * z
-        v = fy * (r10 * mx + r11 * my + r12 * mz + ty) + cy * z
+        x, y, z = np.float64(means[i, 0]), np.float64(means[i, 1]), np.float64(means[i, 2])
         longest = np.float64(max(scales[i, 0], max(scales[i, 1], scales[i, 2])))
-        bound_u = LARGEST_REACH * (longest * across + ROOT * z)
-        bound_v = LARGEST_REACH * (longest * down + ROOT * z)
-        beside = (u + bound_u >= 0.0) & (u - bound_u <= width * z) & (v + bound_v >= 0.0) & (v - bound_v <= height * z)
-        near[i] = (z >= NEAR) & (log_opacities[i] >= LOG_ALPHA_MIN) & beside
+        beside = (_within(left, x, y, z, longest) >= 0.0) & (_within(right, x, y, z, longest) >= 0.0)
+        beside &= (_within(top, x, y, z, longest) >= 0.0) & (_within(bottom, x, y, z, longest) >= 0.0)
+        near[i] = (_within(depth, x, y, z, longest) >= NEAR) & (log_opacities[i] >= LOG_ALPHA_MIN) & beside
 
 
 @called_by_kernels
