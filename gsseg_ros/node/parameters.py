@@ -152,9 +152,9 @@ class Settings:
     @classmethod
     def of(cls, values: dict[str, Any]) -> Settings:
         """Build from the values of all parameters, by name."""
-        for name, default in ((d.name, d.default) for d in DECLARATIONS if d.default != []):
-            if values[name] is None:  # To ROS an empty list has no type, and so fits any.
-                raise SettingsError(f"parameter {name} is an empty list; expected a value such as {default!r}")
+        for one in DECLARATIONS:
+            if values[one.name] is None and one.default != []:  # To ROS an empty list has no type, and so fits any.
+                raise SettingsError(f"parameter {one.name} is an empty list; expected a value such as {one.default!r}")
         similarity = Similarity.from_parameters(*_triple(values, "scene_to_map", with_scale=True))
         camera = pose_from_parameters("camera_in_base", *_triple(values, "camera_in_base"))
         plain = {f.name: values[f.name] for f in fields(cls) if f.name in values}

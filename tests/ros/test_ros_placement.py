@@ -268,6 +268,7 @@ def test_what_is_latched_comes_anew_though_too_many_requests_were_at_work(
             pass
         here.node.set_parameters_atomically(parameters_of(ASIDE, 0.02))
         wait_until(lambda: tries, "the first try")
+        wait_until(lambda: places._cond._waiters, "it waits for room, and does not ask again and again")
         places.release(AT_WORK + WAITING)
         wait_until(lambda: here.outputs._revision > first, "the clouds where the scene is now")
         assert [type(error) for error in tries] == [BusyError], "it asks anew only when there is room"
