@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib
 import os
 import signal
 import sys
@@ -43,6 +44,10 @@ STOP_SECONDS = 3.0
 """How long a job gets to stop when the node is deactivated or shut down."""
 
 SUCCESS = TransitionCallbackReturn.SUCCESS
+
+LIBRARIES = ("scipy.ndimage", "scipy.optimize", "scipy.spatial")
+"""What requests use and do not load themselves: where memory is short, OpenBLAS, which comes with these, tries for ever
+to get its own while it is loaded, and the node would answer nobody any more."""
 
 LATE_SECONDS = 3.0
 """What a job gets beyond that at the end of the node, where it would have nobody left to answer."""
@@ -156,6 +161,8 @@ class SegmentNode(LifecycleNode):
         settings = Settings.read(self)
         self.workspace.configure(settings)
         warm_up(settings.device, self.get_logger().info)
+        for name in LIBRARIES:
+            importlib.import_module(name)
         if settings.scene_path:
             self.workspace.load_scene(*self.workspace.parameter_path("scene_path"), nullcontext())
         self._outputs = Outputs(self, settings.cameras)
