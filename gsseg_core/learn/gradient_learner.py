@@ -10,7 +10,7 @@ import torch
 
 from gsseg_core.csr_rows import CSRRows
 from gsseg_core.errors import SettingsError
-from gsseg_core.learn.all_or_nothing import all_or_nothing
+from gsseg_core.learn.all_or_nothing import fits_whole
 from gsseg_core.learn.learner import Learner, Progress, silent
 from gsseg_core.learn.vote_resolution import is_resolved
 from gsseg_core.raster.observation import Observation
@@ -92,7 +92,7 @@ class GradientLearner(Learner):
         """Cross-entropy summed over the classes (K times CES), in nats per labelled pixel; mean of the last epoch."""
         return self.history_[-1] * self.num_classes if self.history_ else float("nan")
 
-    @all_or_nothing
+    @fits_whole
     def fit(self, progress: Progress = silent) -> GradientLearner:
         """Run all epochs."""
         settings = self.settings

@@ -197,7 +197,7 @@ class Learner(ABC):
 
     @abstractmethod
     def fit(self: Self, progress: Progress = silent) -> Self:
-        """Learn `code_rows_` from the views observed so far; one that takes steps is `all_or_nothing`.
+        """Learn `code_rows_` from the views observed so far; one that takes steps is decorated by `fits_whole`.
 
         Raises
         ------

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 
 from gsseg_core.data.view import View
+from gsseg_core.learn.all_or_nothing import Undo, all_or_nothing, checkpoint
 from gsseg_core.learn.learner import Learner, Progress, silent
 from gsseg_core.learn.learner_state import State
 from gsseg_core.learn.usable_views import read_mask
@@ -56,15 +57,10 @@ class VoteLearner(Learner):
         before, after = self._observed(view.name), view.held()
         self._exchange(before, after, self._operator_of(after))
 
-    def checkpoint(self) -> Callable[[], None]:
-        """Return what goes back to the present views and votes, after anything but `forget`; it takes no memory."""
-        votes, views, num_classes, dropped = self._votes.copy(), dict(self.views), self.num_classes, self.dropped
-
-        def undo() -> None:
-            self._votes, self.views, self.num_classes, self.dropped = votes, views, num_classes, dropped
-            self._prepared.clear()
-
-        return undo
+    def checkpoint(self) -> Undo:
+        """Return what goes back to the present views and votes, after anything but `forget`."""
+        prepared = self._prepared.emptied()
+        return checkpoint(self, _votes=self._votes.copy(), views=dict(self.views), _prepared=prepared)
 
     def keep_last(self, count: int) -> None:
         """Drop the oldest views and their masks, all but so many, of at least one; their votes stay."""
@@ -77,11 +73,8 @@ class VoteLearner(Learner):
         """Put a view in the place of one of its name, seen by the same operator if one is given."""
         new, old = (read_mask(view, self.num_classes) for view in (after, before))
         self._lift(after, new, 1, operator)
-        try:
+        with all_or_nothing(partial(self._lift, after, new, -1, operator)):
             self._lift(before, old, -1, operator)
-        except BaseException:  # Too little memory.
-            self._lift(after, new, -1, operator)
-            raise
         self.views[after.name] = after
         self._prepared.drop(after.name)
 

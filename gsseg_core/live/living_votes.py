@@ -4,12 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Callable, Collection, Mapping
 from dataclasses import replace
+from functools import partial
 from weakref import WeakKeyDictionary
 
 import numpy as np
 
 from gsseg_core.data.view import View
 from gsseg_core.errors import UnknownGroupError
+from gsseg_core.learn.all_or_nothing import all_or_nothing, checkpoint
 from gsseg_core.learn.learner_state import State
 from gsseg_core.learn.usable_views import read_mask
 from gsseg_core.learn.vote_learner import VoteLearner
@@ -64,19 +66,16 @@ class LivingVotes(VoteLearner):
         from_nothing = all_kept and 2 * len(lifted) > len(views)
         names = list(views) if from_nothing else lifted
         order = along_curve(change.after.scene)
-        taken_back, before = [] if from_nothing else lifted, (self._votes, self.living, self.scene)
+        taken_back = [] if from_nothing else lifted
         self._lift_all(self.views, taken_back, -1)
-        try:
+        # With too little memory the scene stays, and with it its votes.
+        with all_or_nothing(checkpoint(self), partial(self._lift_all, self.views, taken_back, 1)):
             if from_nothing:
                 self._votes = VoteTotal(len(change.after), self.num_classes, order)
             else:
                 self._votes = VoteTotal.from_rows(change.carry(self._votes.rows()), self.num_classes, order)
             self.living, self.scene = change.after, change.after.scene
             self._lift_all(views, names, 1)
-        except BaseException:  # Too little memory: the scene stays, and with it its votes.
-            self._votes, self.living, self.scene = before
-            self._lift_all(self.views, taken_back, 1)
-            raise
         self.views = views
         for name in lifted:
             self._ends.pop(views[name], None)

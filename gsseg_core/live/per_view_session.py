@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
+from contextlib import ExitStack
 from dataclasses import replace
 from functools import reduce
 from typing import Any
@@ -14,6 +15,7 @@ from gsseg_core.data.dataset import Dataset
 from gsseg_core.data.label_evidence import VOTE_UNIT
 from gsseg_core.data.view import View
 from gsseg_core.errors import SettingsError
+from gsseg_core.learn.all_or_nothing import all_or_nothing
 from gsseg_core.learn.learner_state import Learnt
 from gsseg_core.learn.vote_learner import VoteLearner
 from gsseg_core.live.results import Outcome, Rejection
@@ -57,11 +59,8 @@ class PerViewSession(LiveSession):
         view, undo = replace(view, class_names=None).held(), self._table.checkpoint()
         if view.has_mask:  # Made once: its segments are lifted, and then the objects that they are.
             operator = operator or make_operator(self.scene, view.camera, self.device)
-        try:
+        with all_or_nothing(undo):
             rejection = super()._fuse(self._table.match(view, operator), operator)
-        except BaseException:  # Too little memory is no GssegError.
-            undo()
-            raise
         if rejection is not None:
             undo()
         return rejection
@@ -77,13 +76,9 @@ class PerViewSession(LiveSession):
                 if self._table.sees_any(after, operator):
                     self._fuse(after, operator)
                 else:
-                    undo = self._table.checkpoint()
-                    try:
+                    with all_or_nothing(self._table.checkpoint()):
                         self._table.set_aside(after)
                         self._live.move(name, after.camera)
-                    except BaseException:
-                        undo()
-                        raise
                     self._version += 1
                 self._live.views = {name: self._live.views[name] for name in order}
             return era is self._era
@@ -94,24 +89,18 @@ class PerViewSession(LiveSession):
         Votes of views that are no longer kept go along with most of their object. Raises `UnknownLabelError` where
         there would be more objects than `max_classes`; nothing has changed then, as after any error.
         """
-        with self._lock:
-            undo, back = self._table.checkpoint(), None
-            try:
-                repair, order = self._table.solve(), [name for name in self._live.views if self._table.sees(name)]
-                moved = bool((repair.successors != np.arange(len(repair.successors))).any())
-                forgotten = self.num_fused > len(order)
-                names = order if moved and forgotten else [name for name in order if name in set(repair.changed)]
-                views = {name: self._table.relabelled(self._table.views[name]) for name in names}
-                learnt = _renumbered(self._learnt, repair.successors) if self._learnt and moved else self._learnt
-                if views:  # All at once: if there is no room for all, there are no more classes than before.
-                    back = self._live.checkpoint()
-                    self._grow_for(max(views.values(), key=lambda view: view.largest_label))
-                self._relabel(views, repair.successors if moved and forgotten else None)
-            except BaseException:
-                undo()
-                if back is not None:
-                    back()
-                raise
+        with self._lock, ExitStack() as whole:
+            whole.enter_context(all_or_nothing(self._table.checkpoint()))
+            repair, order = self._table.solve(), [name for name in self._live.views if self._table.sees(name)]
+            moved = bool((repair.successors != np.arange(len(repair.successors))).any())
+            forgotten = self.num_fused > len(order)
+            names = order if moved and forgotten else [name for name in order if name in set(repair.changed)]
+            views = {name: self._table.relabelled(self._table.views[name]) for name in names}
+            learnt = _renumbered(self._learnt, repair.successors) if self._learnt and moved else self._learnt
+            if views:  # All at once: if there is no room for all, there are no more classes than before.
+                whole.enter_context(all_or_nothing(self._live.checkpoint()))
+                self._grow_for(max(views.values(), key=lambda view: view.largest_label))
+            self._relabel(views, repair.successors if moved and forgotten else None)
             if moved:
                 self._repairs.append(repair.successors)
             self._learnt = learnt

@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
 from typing import Any
 
@@ -15,6 +14,7 @@ from gsseg_core.data.label_images import UNKNOWN
 from gsseg_core.data.view import View
 from gsseg_core.errors import SceneValueError, SettingsError, UnknownLabelError
 from gsseg_core.files.limits import MAX_LABEL
+from gsseg_core.learn.all_or_nothing import Undo, all_or_nothing, checkpoint
 from gsseg_core.objects.association import AssociationSettings, associate
 from gsseg_core.objects.lifted_segments import Lifted, Profiles, sums
 from gsseg_core.objects.tree_growing import grow_tree
@@ -95,7 +95,7 @@ class ObjectTable:
         Returns what `relabelled` does. Takes and raises what `add` does, and raises where there are too many objects;
         then nothing has changed.
         """
-        with self._all_or_nothing():
+        with all_or_nothing(self.checkpoint()):
             if not self.add(view, operator):
                 return _without_labels(view)
             lifted = self._lifted[view.name]
@@ -108,27 +108,10 @@ class ObjectTable:
             self._give(view.name, best)
             return self.relabelled(view)
 
-    def checkpoint(self) -> Callable[[], None]:
+    def checkpoint(self) -> Undo:
         """Return what goes back to the present state, after `add`, `match`, `remove` or `solve`; not after `forget`."""
-        views, lifted, objects = dict(self.views), dict(self._lifted), dict(self._objects)
-        others = self._largest, self._agreement, self._forgotten
-        profiles = self._profiles.copy()
-
-        def undo() -> None:  # It takes no memory: there may be none.
-            self.views, self._lifted, self._objects, self._profiles = views, lifted, objects, profiles
-            self._largest, self._agreement, self._forgotten = others
-
-        return undo
-
-    @contextmanager
-    def _all_or_nothing(self) -> Iterator[None]:
-        """Go back to where it was if the body raises: too little memory for very many segments, or Ctrl-C."""
-        undo = self.checkpoint()
-        try:
-            yield
-        except BaseException:
-            undo()
-            raise
+        copies = {name: dict(getattr(self, name)) for name in ("views", "_lifted", "_objects")}
+        return checkpoint(self, **copies, _profiles=self._profiles.copy())
 
     def adopt(self, view: View) -> Observation | None:
         """Add a view whose ids are the numbers of objects already; returns it lifted, None where `add` tells False."""
@@ -168,7 +151,7 @@ class ObjectTable:
     def remove(self, name: str) -> None:
         """Take a view back, with all its evidence; raises `SettingsError` where there is no such view."""
         self._require(name)
-        with self._all_or_nothing():
+        with all_or_nothing(self.checkpoint()):
             del self.views[name]
             self._lifted.pop(name, None)
             if self._objects.pop(name, None) is not None:
@@ -202,7 +185,7 @@ class ObjectTable:
         Objects that have a number keep it, by the largest overlap; new ones follow, the largest first.
         """
         progress("associate", 0, 1)
-        with self._all_or_nothing():
+        with all_or_nothing(self.checkpoint()):
             solved, self._agreement = associate(self._lifted, self.settings)
             before, successors = self._objects, np.arange(self._largest + 1)
             if before:

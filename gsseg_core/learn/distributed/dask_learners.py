@@ -21,6 +21,7 @@ import numpy as np
 from gsseg_core.csr_rows import CSRRows
 from gsseg_core.data.view import View
 from gsseg_core.errors import GssegError, SchedulerError
+from gsseg_core.learn.all_or_nothing import all_or_nothing, checkpoint
 from gsseg_core.learn.distributed import dask_worker
 from gsseg_core.learn.distributed.dask_cluster import PATIENCE, UNREACHABLE, check_workers, find_workers, name_of
 from gsseg_core.learn.em.em_learner import EMLearner, OverViews, Tick
@@ -72,15 +73,11 @@ class _OnWorkers(Learner):
         named = {view.name: view.held() for view in views}
         if named:
             votes, why = self._sum(dask_worker.sum_votes, named, lambda done: progress("observe", done, len(named)))
-            before = {**vars(self), "views": dict(self.views), "rejected": dict(self.rejected)}
-            try:
-                self._votes = self._votes.copy()
+            copies = {name: getattr(self, name).copy() for name in ("_votes", "views", "rejected")}
+            with all_or_nothing(checkpoint(self, **copies)):
                 self._votes.add_rows(dask_worker.as_compiled_for(votes))
                 for name, view in named.items():
                     self._add(view, UnusableViewError(why[name]) if why[name] else None)
-            except BaseException:  # Too little memory for votes, or to take back those of a view that is replaced.
-                vars(self).update(before)
-                raise
         progress("observe", len(named), len(named))
 
     def _sum(

@@ -35,7 +35,7 @@ from gsseg_core.data.label_evidence import VOTE_UNIT
 from gsseg_core.data.soft_masks import SeenLabels
 from gsseg_core.data.view import View
 from gsseg_core.errors import SettingsError
-from gsseg_core.learn.all_or_nothing import all_or_nothing
+from gsseg_core.learn.all_or_nothing import fits_whole
 from gsseg_core.learn.em import em_kernels as kernels
 from gsseg_core.learn.em.block_weights import block_weights
 from gsseg_core.learn.em.boundary_alignment import align_boundaries, reach
@@ -168,7 +168,7 @@ class EMLearner(Learner):
         """-J per labelled pixel, in nats."""
         return -self.lower_bound_
 
-    @all_or_nothing
+    @fits_whole
     def fit(self, progress: Progress = silent) -> EMLearner:
         """Alternate E and M steps until a step can gain no more than the tolerance."""
         settings = self.settings
