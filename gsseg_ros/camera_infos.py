@@ -9,11 +9,12 @@ import numpy as np
 import numpy.typing as npt
 from sensor_msgs.msg import CameraInfo
 
-from gsseg_core.errors import IntrinsicsError, MaskSizeError
+from gsseg_core.errors import IntrinsicsError
 from gsseg_core.scene.camera import Camera
 from gsseg_core.scene.lens import LENS_MODELS, Lens
 from gsseg_core.scene.undistortion import Undistortion, undistortions
 from gsseg_core.text import clipped
+from gsseg_ros.conversions import require_proportions
 from gsseg_ros.frames import Similarity
 
 AUTO = "auto"
@@ -103,11 +104,7 @@ def camera_of_image(
 def _scale(info: CameraInfo, size: tuple[int, int], topic: str, info_topic: str) -> npt.NDArray[np.float64]:
     """Make the matrix (3, 3) that scales intrinsics of what a camera_info cuts out to an image of another size."""
     (width, height), (across, down) = size, image_size(info, info_topic)
-    if min(abs(width - height * across / down), abs(height - width * down / across)) >= 1:
-        raise MaskSizeError(
-            f"{topic}: image is {width} x {height} pixels; expected {across} x {down}, as {info_topic} "
-            "says, or a size of the same proportions"
-        )
+    require_proportions(size, (across, down), topic, f"{info_topic} says")
     # Binning leaves out what is no whole pixel.
     return np.diag([width / (across * max(info.binning_x, 1)), height / (down * max(info.binning_y, 1)), 1.0])
 

@@ -19,7 +19,7 @@ from sensor_msgs.msg import CameraInfo, Image, PointCloud2, PointField
 from std_msgs.msg import Header
 
 from gsseg_core.data.label_images import UNKNOWN, in_bits
-from gsseg_core.errors import MaskFormatError, PoseError, SceneValueError
+from gsseg_core.errors import MaskFormatError, MaskSizeError, PoseError, SceneValueError
 from gsseg_core.files.limits import MAX_LABEL
 from gsseg_core.scene.camera import Camera, rigid_motion
 from gsseg_ros.errors import TooManyPixelsError
@@ -107,6 +107,16 @@ def require_size(message: Any, max_pixels: int, topic: str) -> None:
     if message.width * message.height > max_pixels:
         size = f"{message.width} x {message.height}"
         raise TooManyPixelsError(f"{topic}: is {size}; expected {max_pixels} pixels at most (parameter max_pixels)")
+
+
+def require_proportions(size: tuple[int, int], expected: tuple[int, int], topic: str, who: str) -> None:
+    """Refuse an image with `MaskSizeError` unless it is larger or smaller by a scale; sizes are width and height."""
+    (width, height), (across, down) = size, expected
+    if min(abs(width - height * across / down), abs(height - width * down / across)) >= 1:
+        raise MaskSizeError(
+            f"{topic}: image is {width} x {height} pixels; expected {across} x {down}, as {who}, or a size of the same "
+            "proportions"
+        )
 
 
 def require_encoding(message: Image, topic: str, known: Collection[str], what: str = "") -> None:

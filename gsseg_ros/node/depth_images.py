@@ -6,11 +6,12 @@ import numpy as np
 import numpy.typing as npt
 from sensor_msgs.msg import Image
 
+from gsseg_core.data.mask_formats.shapes import scaled
 from gsseg_core.data.view import View
 from gsseg_core.errors import GssegError, MaskFormatError
 from gsseg_core.live.session import LiveSession
 from gsseg_core.raster.depth_gating import Gated, gate_view
-from gsseg_ros.conversions import picture_from_image, require_encoding, require_size
+from gsseg_ros.conversions import picture_from_image, require_encoding, require_proportions, require_size
 from gsseg_ros.errors import DepthImageError
 from gsseg_ros.node.parameters import Settings
 
@@ -34,7 +35,9 @@ def gate_by_image(
                 f"{topic}: frame_id is '{message.header.frame_id}', the mask's is '{frame_id}'; expected depth "
                 "registered to the camera of the masks, as depth_image_proc or the camera's driver makes it"
             )
-        depth = _resized(depth_from_image(message, topic), *view.camera.image_size, topic)
+        depth = depth_from_image(message, topic)
+        require_proportions((message.width, message.height), view.camera.image_size, topic, "masks are")
+        depth = scaled(depth, view.camera)
         if view.camera.undistortion is not None:
             depth = view.camera.undistortion.sample(depth, 0)
         scale = settings.scene_to_map.scale
@@ -52,21 +55,3 @@ def depth_from_image(message: Image, topic: str) -> npt.NDArray[np.float32]:
     depth: npt.NDArray[np.float32] = picture_from_image(message, topic).astype(np.float32)
     depth *= np.float32(_METRES[message.encoding])
     return depth
-
-
-def _resized(
-    depth: npt.NDArray[np.float32],  # (H, W)
-    width: int,
-    height: int,
-    topic: str,
-) -> npt.NDArray[np.float32]:
-    """Take the nearest pixels of a depth image for one of another size (height, width)."""
-    rows, columns = depth.shape
-    if min(abs(columns - width * rows / height), abs(rows - height * columns / width)) >= 1:
-        raise MaskFormatError(
-            f"{topic}: image is {columns} x {rows} pixels; expected {width} x {height}, as masks are, or a size of the "
-            "same proportions"
-        )
-    row, column = ((np.arange(n) * 2 + 1) * m // (2 * n) for n, m in ((height, rows), (width, columns)))
-    resized: npt.NDArray[np.float32] = depth[row[:, None], column]
-    return resized
