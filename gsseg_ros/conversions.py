@@ -15,6 +15,7 @@ import numpy as np
 import numpy.typing as npt
 from builtin_interfaces.msg import Time
 from geometry_msgs.msg import Point, Pose, PoseStamped, Quaternion, Transform, Vector3
+from rcl_interfaces.msg import FloatingPointRange, IntegerRange, ParameterDescriptor
 from sensor_msgs.msg import CameraInfo, Image, PointCloud2, PointField
 from std_msgs.msg import Header
 
@@ -251,6 +252,19 @@ def plain_image(
     message = Image(header=header, height=height, width=width, encoding=encoding, is_bigendian=0, step=step)
     message.data = byte_array(values)
     return message
+
+
+def parameter_descriptor(
+    description: str, default: object, low: float | None, high: float | None, **more: bool
+) -> ParameterDescriptor:
+    """Describe a parameter; where it has limits, they are a range of its default's type."""
+    descriptor = ParameterDescriptor(description=description, **more)
+    if low is not None and high is not None:
+        if isinstance(default, int):
+            descriptor.integer_range = [IntegerRange(from_value=int(low), to_value=int(high))]
+        else:
+            descriptor.floating_point_range = [FloatingPointRange(from_value=float(low), to_value=float(high))]
+    return descriptor
 
 
 def camera_info(camera: Camera, header: Header) -> CameraInfo:

@@ -5,7 +5,6 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Any
 
-from rcl_interfaces.msg import FloatingPointRange, IntegerRange, ParameterDescriptor
 from rclpy.node import Node
 from rclpy.parameter import Parameter
 
@@ -15,6 +14,7 @@ from gsseg_core.raster.depth_gating import DepthTolerance
 from gsseg_core.refine.settings import MAX_K, RefineSettings
 from gsseg_core.scene.scene_writers import DEFAULT, SCENE_WRITERS
 from gsseg_ros.camera_infos import AUTO
+from gsseg_ros.conversions import parameter_descriptor
 from gsseg_ros.node.masks.compressed import TRANSPORTS
 
 POSE_SOURCES = ("topic", "odometry", "tf", "auto")
@@ -212,19 +212,7 @@ def declare(node: Node) -> None:
     for declaration in DECLARATIONS:
         # An empty list has no type of its own.
         default = Parameter.Type.STRING_ARRAY if declaration.default == [] else declaration.default
-        node.declare_parameter(declaration.name, default, _descriptor(declaration))
-
-
-def _descriptor(declaration: Declaration) -> ParameterDescriptor:
-    descriptor = ParameterDescriptor(
-        description=declaration.description, read_only=declaration.at_start, dynamic_typing=declaration.any_type
-    )
-    if declaration.low is not None and declaration.high is not None:
-        if isinstance(declaration.default, int):
-            limits = IntegerRange(from_value=int(declaration.low), to_value=int(declaration.high), step=0)
-            descriptor.integer_range = [limits]
-        else:
-            descriptor.floating_point_range = [
-                FloatingPointRange(from_value=float(declaration.low), to_value=float(declaration.high), step=0.0)
-            ]
-    return descriptor
+        text, limits = declaration.description, (declaration.low, declaration.high)
+        flags = {"read_only": declaration.at_start, "dynamic_typing": declaration.any_type}
+        described = parameter_descriptor(text, declaration.default, *limits, **flags)
+        node.declare_parameter(declaration.name, default, described)

@@ -13,7 +13,6 @@ from typing import Any
 import rclpy
 from geometry_msgs.msg import PoseStamped
 from gsseg_msgs.msg import SceneDelta
-from rcl_interfaces.msg import FloatingPointRange, IntegerRange, ParameterDescriptor
 from rclpy.duration import Duration
 from rclpy.exceptions import ParameterException
 from rclpy.executors import SingleThreadedExecutor
@@ -25,7 +24,7 @@ from sensor_msgs.msg import CameraInfo, Image
 
 from gsseg_core.errors import GssegError, SettingsError
 from gsseg_core.freed_memory import search_no_imports_at_the_end
-from gsseg_ros.conversions import stamp_message
+from gsseg_ros.conversions import parameter_descriptor, stamp_message
 from gsseg_ros.replay.sources import TYPES, BagSource, FolderSource, Group, Source
 from gsseg_ros.shared_memory import make_room
 
@@ -134,14 +133,8 @@ class ReplayNode(Node):
         """Declare all parameters and return their values; raises `SettingsError` for a wrong type or range."""
         values = {}
         for name, default, low, high, text in _PARAMETERS:
-            descriptor = ParameterDescriptor(description=text, read_only=True)
-            if low is not None and high is not None:
-                if isinstance(default, int):
-                    descriptor.integer_range = [IntegerRange(from_value=int(low), to_value=int(high), step=0)]
-                else:
-                    descriptor.floating_point_range = [FloatingPointRange(from_value=low, to_value=high, step=0.0)]
             try:
-                self.declare_parameter(name, default, descriptor)
+                self.declare_parameter(name, default, parameter_descriptor(text, default, low, high, read_only=True))
                 values[name] = self.get_parameter(name).value  # An empty list, which has no type, is found here.
             except ParameterException as error:
                 limits = "" if low is None else f" from {low:g} to {high:g}"
