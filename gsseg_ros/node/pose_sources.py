@@ -98,10 +98,12 @@ class PoseSource(Protocol):
         """
 
     def too_late(self, stamp: int) -> bool:
-        """Whether no pose for `stamp` can come any more."""
+        """Whether no pose for `stamp` can come any more; False where that cannot be told."""
+        return False
 
     def refused(self, stamp: int) -> bool:
-        """Whether the pose of `stamp` came, and cannot be used."""
+        """Whether the pose of `stamp` came, and cannot be used; False where that cannot be told."""
+        return False
 
     def set_back(self, before: int, began: int) -> None:
         """Forget what is from before time was set back from `before` to `began` (ns)."""

@@ -11,16 +11,18 @@ import numpy.typing as npt
 
 from gsseg_core.errors import GssegError, SettingsError
 from gsseg_ros.conversions import matrix_from_transform, stamp_ns
+from gsseg_ros.node.pose_sources import PoseSource
 from gsseg_ros.node.timeline import BEHIND_NS
 
 _BEHIND_KEPT = 2000  # Transforms of a frame; at 200 Hz, those of ten seconds.
 _UNDER_WAY = 100  # Transforms from before time was set back that may come after it: as deep as tf2_ros subscribes.
 
 
-class TfPoses:
+class TfPoses(PoseSource):
     """Poses of the frames that masks are stamped with, looked up in TF at the mask's stamp, never the latest.
 
-    It listens from the first question on. Raises `SettingsError`: tf2_ros cannot be imported.
+    It listens from the first question on. It cannot tell that a pose will not come: any transform of a chain still may,
+    and TF does not hand on what it refuses. Raises `SettingsError`: tf2_ros cannot be imported.
     """
 
     knows_frames = True  # Every camera has a pose of its own.
@@ -80,14 +82,6 @@ class TfPoses:
             return None
         self.problem = ""
         return pose
-
-    def too_late(self, stamp: int) -> bool:
-        """Tell nothing: any transform of a chain may still come, so that a mask waits for its time to be over."""
-        return False
-
-    def refused(self, stamp: int) -> bool:
-        """Tell nothing: TF does not hand on what it refuses."""
-        return False
 
     def set_back(self, before: int, began: int) -> None:
         """Forget the transforms from before time was set back from `before` to `began` (ns), but not the static ones.
