@@ -7,7 +7,7 @@ from contextlib import contextmanager
 from typing import Any
 
 from rclpy.exceptions import ParameterException
-from rclpy.qos import DurabilityPolicy, HistoryPolicy, QoSProfile, ReliabilityPolicy
+from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from rclpy.qos_overriding_options import QoSOverridingOptions
 
 from gsseg_core.errors import SettingsError
@@ -21,27 +21,17 @@ def input_data(depth: int) -> QoSProfile:
 
     How reliable it is, `gsseg_ros.node.matched_subscription` finds out.
     """
-    return QoSProfile(
-        history=HistoryPolicy.KEEP_LAST,
-        depth=depth,
-        reliability=ReliabilityPolicy.BEST_AVAILABLE,
-        durability=DurabilityPolicy.VOLATILE,
-    )
+    return QoSProfile(depth=depth, reliability=ReliabilityPolicy.BEST_AVAILABLE, durability=DurabilityPolicy.VOLATILE)
 
 
 def sensor_data() -> QoSProfile:
     """Make a profile as for sensor data, which goes with every subscription but a reliable one."""
-    return QoSProfile(
-        history=HistoryPolicy.KEEP_LAST,
-        depth=30,
-        reliability=ReliabilityPolicy.BEST_EFFORT,
-        durability=DurabilityPolicy.VOLATILE,
-    )
+    return QoSProfile(depth=30, reliability=ReliabilityPolicy.BEST_EFFORT, durability=DurabilityPolicy.VOLATILE)
 
 
-def latched() -> QoSProfile:
+def latched(depth: int = 1) -> QoSProfile:
     """Make a profile for latched topics, whose last message late subscribers get, too."""
-    return QoSProfile(depth=1, reliability=ReliabilityPolicy.RELIABLE, durability=DurabilityPolicy.TRANSIENT_LOCAL)
+    return QoSProfile(depth=depth, reliability=ReliabilityPolicy.RELIABLE, durability=DurabilityPolicy.TRANSIENT_LOCAL)
 
 
 def reliable(depth: int = 100) -> QoSProfile:
@@ -69,12 +59,3 @@ def overridable_publisher(node: Any, kind: Any, topic: str, quality: QoSProfile)
     with clear_overrides(topic):
         overridable = QoSOverridingOptions.with_default_policies()
         return node.create_publisher(kind, topic, quality, qos_overriding_options=overridable)
-
-
-def all_clouds() -> QoSProfile:
-    """Make a profile for a client that wants every cloud.
-
-    Reliable, for large clouds do not arrive otherwise; latched, so that a cloud is not lost that was sent before the
-    two ends had found each other; deep enough that one of another client does not push it out.
-    """
-    return QoSProfile(depth=5, reliability=ReliabilityPolicy.RELIABLE, durability=DurabilityPolicy.TRANSIENT_LOCAL)

@@ -13,7 +13,7 @@ from sensor_msgs.msg import PointCloud2
 from gsseg_ros.client.spinner import Spinner
 from gsseg_ros.conversions import stamp_ns
 from gsseg_ros.errors import NodeUnavailableError
-from gsseg_ros.qos import all_clouds
+from gsseg_ros.qos import latched
 
 _MOST = 16
 """Clouds that are kept; of two that ask in turn, and never rest together, all would be."""
@@ -26,7 +26,8 @@ class RunClouds:
         self._spinner, self._lock = spinner, threading.Lock()
         self._clouds: dict[int, PointCloud2] = {}  # by stamp [ns]
         self._awaiting = 0
-        self._topic = spinner.node.create_subscription(PointCloud2, topic, self._on_cloud, all_clouds())
+        # Latched for a cloud that was sent before the two ends had found each other; others do not push it out so soon.
+        self._topic = spinner.node.create_subscription(PointCloud2, topic, self._on_cloud, latched(5))
 
     @contextlib.contextmanager
     def kept(self) -> Iterator[None]:
