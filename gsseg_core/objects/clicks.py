@@ -53,8 +53,8 @@ def click_labels(
     Raises `SettingsError` where there is no such pixel, no click inside, or a pixel is clicked as both, and
     `NoUsableViewsError` where a click inside shows no Gaussian.
     """
-    for row, column in (*inside, *outside):
-        camera.checked_pixel(row, column)
+    # As tuples, which sets can hold: of JSON they are lists, of NumPy rows.
+    inside, outside = ([camera.checked_pixel(*click) for click in clicks] for clicks in (inside, outside))
     if not inside or set(inside) & set(outside):
         raise SettingsError(
             f"clicks: {len(inside)} inside, {len(set(inside) & set(outside))} of them outside too; expected at least "

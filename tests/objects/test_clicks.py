@@ -98,6 +98,13 @@ def test_a_click_in_one_view_gives_the_object_in_3d() -> None:
     assert iou(picked.membership >= 0.5, TRUTH == 1) > 0.6
 
 
+def test_clicks_are_the_same_as_tuples_as_lists_of_json_and_as_rows_of_an_array() -> None:
+    clicks = [(24, 20), (26, 21)], [(1, 1)]
+    expected = click_labels(SCENE, CAMERA, *clicks)
+    for other in ([[list(click) for click in part] for part in clicks], [np.array(part) for part in clicks]):
+        np.testing.assert_array_equal(click_labels(SCENE, CAMERA, *other), expected)
+
+
 def test_clicks_that_say_nothing_are_refused() -> None:
     with pytest.raises(SettingsError, match="expected a row from 0 to"):
         click_labels(SCENE, CAMERA, [(-1, 0)])
