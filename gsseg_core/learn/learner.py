@@ -38,9 +38,11 @@ Self = TypeVar("Self", bound="Learner")
 R = TypeVar("R")
 
 
-def _check_num_classes(num_classes: int) -> None:
+def _checked_num_classes(num_classes: int) -> int:
+    """Return it as Python's own, or raise `SettingsError`: products of NumPy's short ones overflow."""
     if not isinstance(num_classes, int | np.integer) or not 1 <= num_classes <= MAX_LABEL + 1:
         raise SettingsError(f"num_classes is {num_classes}; expected a whole number from 1 to {MAX_LABEL + 1}")
+    return int(num_classes)
 
 
 class Learner(ABC):
@@ -91,7 +93,7 @@ class Learner(ABC):
     def __init__(
         self, scene: GaussianScene, num_classes: int, *, device: str = "cpu", memory_budget: int | None = None
     ) -> None:
-        _check_num_classes(num_classes)
+        num_classes = _checked_num_classes(num_classes)
         memory_budget = default_budget(device) if memory_budget is None else memory_budget
         if memory_budget < 0:
             raise SettingsError(f"memory_budget is {memory_budget} bytes; expected at least 0")
@@ -171,7 +173,7 @@ class Learner(ABC):
 
         Votes for others are gone, and so is what `fit` has learnt of them.
         """
-        _check_num_classes(num_classes)
+        num_classes = _checked_num_classes(num_classes)
         shrinks = num_classes < self.num_classes
         if shrinks and num_classes <= (largest := max([0, *(view.largest_label for view in self.views.values())])):
             raise SettingsError(f"num_classes is {num_classes}; expected more than {largest}, which a view shows")

@@ -75,9 +75,9 @@ class LiveSession:
         for name, value in (("max_views", max_views), ("max_classes", max_classes)):
             if not isinstance(value, int | np.integer) or value < 1:
                 raise SettingsError(f"{name} is {value}; expected at least 1, a whole number")
-        self.scene, self.max_views, self.device = scene, max_views, device
+        self.scene, self.max_views, self.device = scene, int(max_views), device  # NumPy's may have no sign
         self.rejected: Counter[str] = Counter()
-        self._classes = SessionClasses(class_names, max_classes)
+        self._classes = SessionClasses(class_names, int(max_classes))
         self._lock, self._version = threading.RLock(), 0
         self._scenes: WeakKeyDictionary[Segmentation, GaussianScene] = WeakKeyDictionary()
         self._forget({}, self._no_votes(self._classes.least))

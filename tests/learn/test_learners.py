@@ -358,6 +358,14 @@ def test_one_class_only_works(kind: type[Learner]) -> None:
 
 
 @every_learner
+def test_a_number_of_classes_that_is_one_of_numpys_short_ones_gives_the_same(kind: type[Learner]) -> None:
+    views = [View.from_arrays(view.camera, (60 * view.read_labels()).astype(np.uint8)) for view in VIEWS]
+    count = max(view.read_labels().astype(np.uint8).max() for view in views) + np.uint8(1)
+    expected, learner = (taught(kind(SCENE, num_classes), views).fit() for num_classes in (181, count))
+    np.testing.assert_array_equal(learner.codes_, expected.codes_)
+
+
+@every_learner
 def test_progress_is_told_from_start_to_end(kind: type[Learner]) -> None:
     calls: list[tuple[str, int, int]] = []
     taught(kind(SCENE, NUM_CLASSES), VIEWS[:2]).fit(lambda *call: calls.append(call))

@@ -138,6 +138,7 @@ def test_only_the_last_views_are_kept_and_no_vote_is_dropped() -> None:
     np.testing.assert_array_equal(session.codes(), fed(LiveSession(SCENE, NAMES)).codes())
     expected = taught(EMLearner(SCENE, NUM_CLASSES), VIEWS[-2:]).fit().codes_
     np.testing.assert_array_equal(session.learn().learnt.codes.dense(NUM_CLASSES), expected)
+    assert fed(LiveSession(SCENE, NAMES, max_views=np.uint8(2))).num_views == 2  # type: ignore[arg-type]
     for count in (0, 2.5):
         with pytest.raises(SettingsError, match=f"max_views is {count}; expected at least 1, a whole number"):
             LiveSession(SCENE, NAMES, max_views=count)  # type: ignore[arg-type]
