@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import suppress
 from typing import Any
 
 from rclpy.executors import Executor, ExternalShutdownException, ShutdownException, TimeoutException
@@ -52,15 +52,24 @@ class NodeExecutor(Executor):
         """Log nothing any more: the node is taken away from callbacks that cannot be waited for."""
         self._heard = False
 
-    def _take_waitable(self, waitable: Any) -> Any:
-        """Take what has come of an event; nothing where its topic was taken away meanwhile.
+    def _make_handler(self, entity: Any, node: Any, take: Callable[[Any], Any], *rest: Any) -> Task:
+        """Make what takes in a message, a request or an event that has come, and runs its callback.
 
-        rclpy does so for all but these. What is raised here would keep their callback group busy for good: in that of
-        the publishers, nobody could ask for a parameter any more.
+        Where taking it in raises an error, rclpy keeps the callback group busy for good: a single mask for which there
+        was too little memory, and the node would hear nothing any more. Here it is lost, and all others go on.
         """
-        with suppress(InvalidHandle):
-            return super()._take_waitable(waitable)
-        return None
+
+        def taken(entity: Any) -> Any:
+            try:
+                return take(entity)
+            except InvalidHandle:  # Of an event whose topic was taken away meanwhile; rclpy sees to all others.
+                return None
+            except Exception as error:
+                name = getattr(entity, "topic_name", "") or getattr(entity, "srv_name", "") or type(entity).__name__
+                self._log.error(f"{name}: what has come cannot be taken in, and is lost: {describe(error)}")
+                return None
+
+        return super()._make_handler(entity, node, taken, *rest)
 
     def _run(self, task: Task) -> None:
         try:

@@ -7,12 +7,13 @@ from typing import Any
 
 import pytest
 from rcl_interfaces.srv import GetParameters
+from rclpy.callback_groups import MutuallyExclusiveCallbackGroup
 from rclpy.lifecycle import TransitionCallbackReturn
 from rclpy.qos import QoSProfile, ReliabilityPolicy
 from ros_fixtures import node_fixture, parameters_fixture, root_fixture  # noqa: F401
 from ros_helpers import PATIENCE, Ros, ros_fixture  # noqa: F401
 from ros_robot import CLASSES, RELIABLE
-from sensor_msgs.msg import PointCloud2
+from sensor_msgs.msg import Image, PointCloud2
 
 from gsseg_ros.node.node_executor import NodeExecutor
 from gsseg_ros.node.segment_node import SegmentNode
@@ -55,6 +56,31 @@ def test_a_topic_that_goes_while_callbacks_are_waited_for_is_no_error(
     executor.spin_once(0.05)
     executor.shutdown()
     assert said == []
+
+
+def test_a_message_for_which_there_is_too_little_memory_is_lost_and_its_callback_group_goes_on(
+    ros: Ros, node: SegmentNode, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    executor, said, heard = NodeExecutor(node), list[str](), list[Any]()
+    monkeypatch.setattr(executor, "_log", SimpleNamespace(error=said.append))
+    group = MutuallyExclusiveCallbackGroup()
+    subscription = node.create_subscription(Image, "mask", heard.append, RELIABLE, callback_group=group)
+    beside = node.create_subscription(Image, "image", heard.append, RELIABLE, callback_group=group)
+    publishers = [ros.node.create_publisher(Image, topic, RELIABLE) for topic in ("mask", "image")]
+    ros.wait_until(lambda: all(publisher.get_subscription_count() for publisher in publishers), "both subscriptions")
+    kind, subscription.msg_type = subscription.msg_type, SimpleNamespace  # As good as one that does not fit.
+
+    def publish_until(condition: Any, what: str) -> None:
+        for publisher in publishers:
+            publisher.publish(Image())
+        ros.wait_until(lambda: executor.spin_once(0.05) or condition(), what)
+
+    publish_until(lambda: said and heard, "one message that cannot be taken in, and one that can")
+    subscription.msg_type = kind
+    publish_until(lambda: len(heard) == 3, "both messages of the second round")
+    executor.shutdown()
+    assert group.can_execute(subscription) and group.can_execute(beside)
+    assert len(said) == 1 and said[0].startswith("/mask: what has come cannot be taken in, and is lost: ")
 
 
 def test_topics_of_classes_which_may_be_hundreds_are_nothing_that_the_executor_looks_at(node: SegmentNode) -> None:
