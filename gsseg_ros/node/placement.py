@@ -66,9 +66,14 @@ class Placement:
         self._moved_from, self._left = {}, {}
 
     def _begin(self) -> None:
-        if not self._running:
-            self._running = True
+        if self._running:
+            return
+        try:
             threading.Thread(target=self._follow, name="placement", daemon=True).start()
+            self._running = True
+        except RuntimeError as error:  # Memory is too short for a thread.
+            later = "they do with its next change, or with ~/learn, ~/save_state or ~/export"
+            self.refused(f"views do not follow the scene yet ({error}); {later}")
 
     def _follow(self) -> None:
         self.finish()

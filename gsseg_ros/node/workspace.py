@@ -7,7 +7,7 @@ import threading
 import time
 from collections import Counter
 from collections.abc import Callable, Iterator
-from contextlib import AbstractContextManager, contextmanager
+from contextlib import AbstractContextManager, contextmanager, suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -164,7 +164,7 @@ class Workspace:
             self._replace(session)
         self.dropped = Counter()
         self.forget_waiting()
-        session.prepare(RefineSettings(k=settings.k))
+        self._prepare(session)
 
     def grow_scene(
         self, path: str | Path, within: Path | None, tolerance: float, placed: AbstractContextManager[object]
@@ -177,8 +177,13 @@ class Workspace:
         with self.placement.fusing, placed:  # No mask is fused, and no view follows, before it is clear where to.
             changed = session.replace_scene(scene, tolerance)
         self.count(changed)
-        session.prepare(RefineSettings(k=self.settings.k))
+        self._prepare(session)
         return changed
+
+    def _prepare(self, session: LiveSession) -> None:
+        """Begin to find what the first request needs; without memory for a thread, that request finds it itself."""
+        with suppress(RuntimeError):
+            session.prepare(RefineSettings(k=self.settings.k))
 
     def count(self, changed: Changed) -> None:
         """Count a change of the scene."""
