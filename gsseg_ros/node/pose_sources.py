@@ -18,7 +18,7 @@ from gsseg_ros.node.timeline import BEHIND_NS, SECOND
 
 Pose: TypeAlias = npt.NDArray[np.float64]  # (4, 4)
 
-_POSES_KEPT = 2000  # At 200 Hz, those of ten seconds.
+_POSES_KEPT = 10_000  # At 1 kHz, those of ten seconds.
 
 
 @dataclass(frozen=True, eq=False)

@@ -34,6 +34,15 @@ def test_poses_are_neither_extrapolated_nor_interpolated_over_a_gap(stamp: int) 
     assert poses.at(stamp) is None
 
 
+def test_a_segmenter_may_take_nine_seconds_beside_an_odometry_of_a_kilohertz() -> None:
+    pairing, taken = Pairing(InterpolatedPoses()), 1000 * S
+    pairing.add_camera_info(taken, "info", "camera")
+    for stamp in range(taken - 3 * MS, taken + 9 * S, MS):
+        pairing.add_pose(stamp, GivenPose(pose(1.0)))
+    pairing.add_mask(taken, "mask", "camera")
+    assert [paired.stamp for paired in pairing.take()] == [taken] and not pairing.dropped
+
+
 @pytest.mark.skipif(HAS_TF, reason="tf2_ros is here")
 def test_without_tf2_ros_the_error_names_the_parameter_and_the_package() -> None:
     pytest.importorskip("geometry_msgs")
