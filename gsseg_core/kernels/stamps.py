@@ -24,7 +24,8 @@ _COMPILES = re.compile(rb"^(?:from|import) (?:numba|llvmlite|\S*kernels\.compile
 def stamp_of(kernel: Callable[..., Any]) -> bytes:
     """Hash all that a kernel may be compiled from, when it is defined: files, and numbers that come from others.
 
-    The files are that of its module and those of all modules with compiled code that this imports, directly or not.
+    The files are that of its module, those of all modules with compiled code that this imports, directly or not, and
+    those here by which all are compiled.
     Other modules give it numbers and the fields of tuples, which count by their values: to change the reader of a
     format compiles nothing anew. Imports inside functions do not count, since kernels have none.
     """
@@ -43,7 +44,14 @@ def _stamp(module: str, root: Path) -> bytes:
         found.append((name, content, repr(_numbers(sys.modules.get(name)))))
         waiting += [one for one in imported if one not in seen]
         seen.update(imported)
-    return hashlib.sha256(repr(sorted(found)).encode()).digest()
+    return hashlib.sha256(repr((sorted(found), _compilers())).encode()).digest()
+
+
+@cache
+def _compilers() -> list[bytes]:
+    """Read what takes part in compiling: imports of kernels do not lead there, as it depends on numba's version."""
+    contents = [path.read_bytes() for path in sorted(Path(__file__).parent.glob("*.py"))]
+    return [content for content in contents if _COMPILES.search(content)]
 
 
 @cache

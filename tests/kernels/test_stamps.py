@@ -6,10 +6,14 @@ import shutil
 import subprocess
 import sys
 from collections.abc import Callable, Iterator
+from importlib.util import module_from_spec, spec_from_file_location
 from pathlib import Path
 from typing import Any
 
 import pytest
+
+from gsseg_core.csr_rows import largest
+from gsseg_core.kernels import stamps
 
 FILES = {
     "__init__": "",
@@ -114,3 +118,24 @@ def test_a_kernel_is_compiled_anew_where_a_type_that_it_takes_has_another_name_o
     (made / f"{file}.py").write_text(pair.format("Two"))
     (made / "kernels.py").write_text(double.format(file, "Two"))
     assert called_from(tmp_path, call) == "6 0" and called_from(tmp_path, call) == "6 1"
+
+
+@pytest.mark.parametrize(
+    ("file", "is_compiled_anew"),
+    [("compiler", True), ("loading", True), ("parts", True), ("returned", True), ("kernel_cache", False)],
+)
+def test_kernels_are_compiled_anew_where_what_compiles_them_has_changed(
+    tmp_path: Path, file: str, is_compiled_anew: bool
+) -> None:
+    def stamp() -> bytes:
+        spec = spec_from_file_location("stamps", folder / "stamps.py")
+        assert spec is not None and spec.loader is not None
+        made = module_from_spec(spec)
+        spec.loader.exec_module(made)
+        return made.stamp_of(largest.py_func)
+
+    folder = shutil.copytree(Path(stamps.__file__).parent, tmp_path / "kernels")
+    before = stamp()
+    with open(folder / f"{file}.py", "a") as content:
+        content.write("\n# Changed.\n")
+    assert (stamp() != before) is is_compiled_anew
