@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import errno
 import math
 import struct
+import tempfile
 from pathlib import Path
 
 import pycolmap
@@ -17,7 +19,7 @@ from camera_folders import (
 )
 
 from gsseg_core.data.camera_files import read_cameras
-from gsseg_core.errors import CameraFileError, PathNotAllowedError, PoseError
+from gsseg_core.errors import CameraFileError, PathNotAllowedError, PoseError, WriteError
 
 
 @pytest.mark.parametrize("text", [False, True], ids=["bin", "txt"])
@@ -161,3 +163,20 @@ def test_a_colmap_model_may_go_once_it_is_read(tmp_path: Path, monkeypatch: pyte
 
     monkeypatch.setattr(pycolmap, "Reconstruction", loaded_then_gone)
     assert_lands(read_cameras(tmp_path)[0], 55, 35)
+
+
+def test_where_the_temporary_folder_is_full_no_file_of_a_colmap_model_is_blamed(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def full(path: Path, content: bytes) -> int:
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    write_colmap(tmp_path / "sparse")
+    (tmp_path / "temporary").mkdir()
+    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path / "temporary"))
+    monkeypatch.setattr(Path, "write_bytes", full)
+    with pytest.raises(WriteError, match=r"/temporary: cannot be written \(No space left on device\); .* TMPDIR"):
+        read_cameras(tmp_path)
+    (tmp_path / "temporary").rmdir()
+    with pytest.raises(WriteError, match=r"/temporary: cannot be written \(No such file"):
+        read_cameras(tmp_path)

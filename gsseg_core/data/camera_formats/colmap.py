@@ -7,14 +7,16 @@ import re
 import shutil
 import struct
 import tempfile
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from io import BytesIO
 from pathlib import Path
 from typing import TYPE_CHECKING, BinaryIO
 
 import numpy as np
 
 from gsseg_core.data.camera_formats.entries import Intrinsics, cameras_of, stem_of
-from gsseg_core.errors import CameraFileError, IntrinsicsError, PoseError
+from gsseg_core.errors import CameraFileError, IntrinsicsError, PoseError, WriteError
 from gsseg_core.files.input_files import UnfitError, is_there, open_input, reason
 from gsseg_core.scene.camera import Camera
 from gsseg_core.scene.lens import MODELS_BY_NAME
@@ -76,21 +78,23 @@ def _load(path: Path, within: Path | None) -> pycolmap.Reconstruction:
     cameras, images = (path / f"{name}{suffix}" for name in ("cameras", "images"))
     if not is_there(images, CameraFileError):
         raise CameraFileError(f"{path}: COLMAP model has {cameras.name} but no {images.name}")
-    with tempfile.TemporaryDirectory() as folder:
+    with _temporary_folder(path) as folder:
         # What was checked is what pycolmap reads, so it gets a copy.
         copies: list[_Copy] = [_copy_cameras, _copy_images]
         if suffix == ".txt":
             copies = [shutil.copyfileobj, _copy_images_of_text]
         for file, copy in zip((cameras, images), copies, strict=True):
+            copied = BytesIO()
             try:
-                with open_input(file, within) as source, open(Path(folder) / file.name, "wb") as target:
-                    copy(source, target)
+                with open_input(file, within) as source:
+                    copy(source, copied)
             except OSError as error:
                 raise CameraFileError(f"{file}: cannot be read ({reason(error)})") from error
             except UnfitError as error:
                 raise CameraFileError(f"{file}: {error}") from error
             except (struct.error, ValueError) as error:
                 raise CameraFileError(f"{file}: is truncated; expected a whole COLMAP model") from error
+            (Path(folder) / file.name).write_bytes(copied.getvalue())
         (Path(folder) / f"points3D{suffix}").write_bytes(bytes(8) if suffix == ".bin" else b"")
         try:
             model = pycolmap.Reconstruction(folder)
@@ -102,6 +106,19 @@ def _load(path: Path, within: Path | None) -> pycolmap.Reconstruction:
     if suffix == ".bin" and found < size:
         raise CameraFileError(f"{cameras}: is truncated; expected at least {size} bytes")
     return model
+
+
+@contextmanager
+def _temporary_folder(path: Path) -> Iterator[str]:
+    """Make a folder for a copy of a model, for as long as the context; `WriteError` if it cannot be written."""
+    try:
+        with tempfile.TemporaryDirectory() as folder:
+            yield folder
+    except OSError as error:
+        raise WriteError(
+            f"{tempfile.tempdir or 'temporary folder'}: cannot be written ({reason(error)}); expected space for a copy "
+            f"of {path}, there or in a folder that the environment variable TMPDIR names"
+        ) from error
 
 
 def _copy_cameras(source: BinaryIO, target: BinaryIO) -> None:
@@ -133,9 +150,10 @@ def _copy_images(source: BinaryIO, target: BinaryIO) -> None:
 
 
 def _copy_images_of_text(source: BinaryIO, target: BinaryIO) -> None:
-    """Copy a list of images in text, each in two lines; spaces in names are replaced, as pycolmap would end them there.
+    """Copy a list of images in text without their points, each in two lines; spaces in names are replaced.
 
-    COLMAP itself writes such names. Raises `UnfitError` where no line of points follows an image.
+    COLMAP itself writes such names, and pycolmap would end them there. Raises `UnfitError` where no line of points
+    follows an image.
     """
     for line in source:
         if (image := line.strip()) and not image.startswith(b"#"):
@@ -146,5 +164,5 @@ def _copy_images_of_text(source: BinaryIO, target: BinaryIO) -> None:
                 raise UnfitError(
                     f"after image {image_name} comes {found}; expected its points, or an empty line if there are none"
                 )
-            line = b" ".join([*pose, name.replace(b" ", _SPACE.encode())]) + b"\n" + points
+            line = b" ".join([*pose, name.replace(b" ", _SPACE.encode())]) + b"\n\n"  # of its points, an empty line
         target.write(line)
