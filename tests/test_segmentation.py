@@ -196,6 +196,9 @@ def test_evidence_that_is_no_number_of_pixels_is_refused_and_codes_stay_as_they_
 
 def test_a_missing_truncated_or_foreign_file_is_refused(tmp_path: Path) -> None:
     path = tmp_path / "segmentation.npz"
+    for impossible in ("x" * 300, "nul\0"):
+        with pytest.raises(StateFileError, match="is not a segmentation"):
+            Segmentation.load(impossible, SCENE)
     with pytest.raises(StateFileError, match="does not exist"):
         Segmentation.load(path, SCENE)
     refined().save(path)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from pathlib import Path
 from typing import Any
 
@@ -26,7 +27,7 @@ def read_segmentation(path: Path, digest: str, num_gaussians: int) -> dict[str, 
     Raises `StateFileError` where it is missing or damaged, or holds what no segmentation holds; `StateMismatchError`
     where it belongs to another scene.
     """
-    if (path / "segmentation.npz").is_file():
+    if os.path.isfile(path / "segmentation.npz"):  # Path asks the same, and raises where it may not look.
         raise StateFileError(f"{path}: is a folder; expected a segmentation.npz; type {path / 'segmentation.npz'}")
     with open_npz(path, "a segmentation.npz", (FORMAT,), digest) as (file, header):
         names, temperature = class_names_of(header), temperature_of(header)

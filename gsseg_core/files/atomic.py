@@ -9,7 +9,7 @@ import os
 import re
 import secrets
 import stat
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from pathlib import Path
 
 from gsseg_core.errors import PathTakenError, WriteError
@@ -51,8 +51,7 @@ def write_atomically(path: str | os.PathLike[str]) -> Iterator[Path]:
                 temporary.unlink(missing_ok=True)
             if lock >= 0:
                 os.close(lock)
-            for folder in made:  # Only those that are empty can be removed: after a success, none.
-                folder.rmdir()
+        remove_empty(made)  # After a success, none is.
 
 
 def check_writable(path: str | os.PathLike[str]) -> None:
@@ -108,6 +107,13 @@ def sync_folder(folder: Path) -> None:
             os.fsync(file)
         finally:
             os.close(file)
+
+
+def remove_empty(folders: Iterable[Path]) -> None:
+    """Remove those of some folders, the innermost first, that are there and empty."""
+    for folder in folders:
+        with contextlib.suppress(OSError, ValueError):  # ValueError: a NUL in the path
+            folder.rmdir()
 
 
 def remove_leftovers(folder: Path) -> None:

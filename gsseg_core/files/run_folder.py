@@ -33,7 +33,8 @@ from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 from gsseg_core.errors import GssegError, PathTakenError, WriteError
-from gsseg_core.files.atomic import check_changeable, remove_leftovers, sync_folder, try_lock
+from gsseg_core.files.atomic import check_changeable, remove_empty, remove_leftovers, sync_folder, try_lock
+from gsseg_core.files.input_files import reason
 from gsseg_core.files.run_manifest import FileRecord, Manifest, RunRecord
 
 RUN_FILE, COMMIT_FILE = ".gsseg-run.json", ".gsseg-commit.json"
@@ -112,7 +113,7 @@ class StagedRun:
                 probe.flush()
                 os.fsync(probe.fileno())  # Some disks say only now that they are full.
             os.unlink(self._staging / "probe")
-        except OSError as error:
+        except (OSError, ValueError) as error:  # ValueError: a NUL in the path
             raise _unwritable(self.out, error) from error
 
     def claim(self, places: Iterable[str]) -> None:
@@ -188,9 +189,7 @@ class StagedRun:
                 settle(self.out)  # Something raised an error in the middle of the move, Ctrl-C for example.
             else:
                 shutil.rmtree(self._staging, ignore_errors=True)
-                with contextlib.suppress(OSError):
-                    for folder in self._made:
-                        folder.rmdir()
+                remove_empty(self._made)
         finally:
             if self._lock >= 0:
                 os.close(self._lock)
@@ -227,9 +226,7 @@ def _finish(out: Path) -> None:
         for place in gone:
             if place in unchanged:
                 (out / place).unlink()
-                with contextlib.suppress(OSError):
-                    for folder in Path(place).parents[:-1]:
-                        (out / folder).rmdir()
+                remove_empty(out / folder for folder in Path(place).parents[:-1])
             elif _lies_in(out, place):
                 _move_aside(out / place, run_id)
         for folder in {(out / place).parent for place in places | before.keys()}:
@@ -254,9 +251,9 @@ def _read_commit(path: Path) -> Manifest:
         ) from error
 
 
-def _unwritable(out: Path, error: OSError) -> WriteError:
+def _unwritable(out: Path, error: OSError | ValueError) -> WriteError:
     expected = "a folder that can be made or written to, with free space"
-    return WriteError(f"{out}: cannot be written ({error.strerror or error}); expected {expected}")
+    return WriteError(f"{out}: cannot be written ({reason(error)}); expected {expected}")
 
 
 def _move_aside(path: Path, run_id: str) -> None:

@@ -155,3 +155,9 @@ def test_a_path_that_cannot_be_written_is_known_before_the_work(tmp_path: Path, 
     check_writable(tmp_path / "file")
     check_writable(tmp_path / "no" / "such" / "folder" / "yet.json")
     assert [path.name for path in tmp_path.iterdir()] == ["file"]
+
+
+def test_folders_that_were_made_are_removed_where_one_of_them_could_not_be(tmp_path: Path) -> None:
+    with pytest.raises(WriteError, match="too long"), write_atomically(tmp_path / "made" / ("x" * 300) / "a.json"):
+        pytest.fail("there is nothing to write to")
+    assert list(tmp_path.iterdir()) == []

@@ -371,3 +371,10 @@ def test_a_lock_that_is_never_released_is_one_clear_error(tmp_path: Path, monkey
     monkeypatch.setattr(run_folder, "_PATIENCE", 0.1)
     with run_folder._locked(tmp_path), pytest.raises(WriteError, match="another process of gsseg"):
         write(tmp_path, FIRST)
+
+
+@pytest.mark.parametrize("name", ["nul\0", "lone\ud800", "x" * 300])
+def test_a_folder_of_a_name_that_none_can_have_is_refused_as_any_that_cannot_be_made(tmp_path: Path, name: str) -> None:
+    with pytest.raises(WriteError, match=r": cannot be written \(.*\); expected a folder that can be made"):
+        write(tmp_path / "made" / name, FIRST)
+    assert list(tmp_path.iterdir()) == []
