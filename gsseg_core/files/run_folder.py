@@ -22,6 +22,7 @@ keeps its content as `<name>.edited-<id>`. A place that something else has taken
 from __future__ import annotations
 
 import contextlib
+import errno
 import os
 import re
 import secrets
@@ -127,7 +128,9 @@ class StagedRun:
         for place in places:
             _check_free(self.out, place, manifest, self._kind)
         # What cannot be moved into its place, or out of it, would leave the folder between two runs, for everybody.
-        gone = (place for place in manifest.files(self._kind) if _lies_in(self.out, place))
+        gone = [place for place in manifest.files(self._kind) if _lies_in(self.out, place)]
+        for folder in sorted({folder for place in (*places, *gone) for folder in Path(place).parents[:-1]}):
+            _check_same_disk(self._staging, self.out / folder)
         try:
             for place in sorted({RUN_FILE, *places, *gone}):
                 check_changeable(self.out / place, self.out / place)
@@ -283,6 +286,17 @@ def _check_free(out: Path, place: str, manifest: Manifest, kind: str) -> None:
         raise PathTakenError(
             f"{path}: was not written by gsseg {kind}, so it is not replaced; expected nothing there, or another folder"
         )
+
+
+def _check_same_disk(staging: Path, folder: Path) -> None:
+    """Raise `PathTakenError` if files of the folder in which a run is staged cannot be renamed into another one."""
+    try:
+        os.rename(staging / "none", folder / "none")  # Linux looks at the disks before it looks for the file.
+    except OSError as error:
+        if error.errno == errno.EXDEV:
+            raise PathTakenError(
+                f"{folder}: has another disk mounted there; expected one on the disk of {staging.parent}, or nothing"
+            ) from error
 
 
 def _is_folder(path: Path) -> bool:

@@ -7,6 +7,7 @@ import json
 import os
 import shutil
 import signal
+import subprocess
 import sys
 import threading
 from collections.abc import Callable
@@ -378,3 +379,17 @@ def test_a_folder_of_a_name_that_none_can_have_is_refused_as_any_that_cannot_be_
     with pytest.raises(WriteError, match=r": cannot be written \(.*\); expected a folder that can be made"):
         write(tmp_path / "made" / name, FIRST)
     assert list(tmp_path.iterdir()) == []
+
+
+def test_a_disk_mounted_in_the_place_of_a_folder_is_refused_before_the_work(tmp_path: Path) -> None:
+    (tmp_path / "classes").mkdir()
+    write(tmp_path, FIRST[:1])
+    before = contents(tmp_path)
+    mounted = ["unshare", "-rm", "sh", "-c", 'mount -t tmpfs none "$0" && exec "$@"', str(tmp_path / "classes")]
+    if subprocess.run([*mounted, "true"], check=False).returncode:
+        pytest.skip("no disk can be mounted here")
+    program = f"import sys; sys.path[:] = {sys.path}; from test_run_folder import *\n"
+    program += f"write(Path({str(tmp_path)!r}), FIRST, places=FIRST)"
+    done = subprocess.run([*mounted, sys.executable, "-c", program], stderr=subprocess.PIPE, text=True, check=False)
+    assert f"PathTakenError: {tmp_path}/classes: has another disk mounted there; expected one" in done.stderr
+    assert contents(tmp_path) == before and hidden(tmp_path) == [RUN_FILE]
