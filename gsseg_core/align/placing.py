@@ -220,6 +220,8 @@ def _frame_of_training(
         if (similarity := frame_of_training(dataset.root, path)) is not None:
             return path, similarity
     if given is not None:
+        if not is_there(Path(given), CameraFileError):
+            raise CameraFileError(f"{Path(given)}: does not exist; expected nerfstudio's {DATAPARSER}")
         raise CameraFileError(
             f"{Path(given)}: says nothing of the cameras of {dataset.root}; expected some that nerfstudio trains from"
         )

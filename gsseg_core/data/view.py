@@ -95,7 +95,7 @@ class View:
         camera : Camera
             Where from.
         labels : (H, W) of int
-            The mask.
+            The mask; what a NumPy masked array masks is unknown.
         class_names : mapping from id to name, optional
             Labels must be among its ids.
         supervised : collection of int, optional
@@ -109,6 +109,8 @@ class View:
         array, source = np.asarray(labels), f"view '{camera.name}'"
         if array.ndim != 2 or array.dtype.kind not in "iu":
             raise MaskFormatError(f"{source}: labels are {Header.of(array)}; expected integers (H, W)")
+        if isinstance(labels, np.ma.MaskedArray):
+            array = np.ma.filled(labels.astype(np.int64), UNKNOWN)
         seen = SeenLabels(array)
         if supervised is not None:
             cls(camera, class_names=class_names)._check_seen(seen, source)

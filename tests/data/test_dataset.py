@@ -72,6 +72,11 @@ def test_a_mask_that_is_held_needs_its_file_no_more(tmp_path: Path) -> None:
     assert view.mask_bits == 8
 
 
+def test_what_is_masked_of_labels_in_memory_is_unknown() -> None:
+    labels = np.ma.MaskedArray(LABELS.astype(np.uint8), mask=LABELS == 2)
+    assert np.array_equal(View.from_arrays(camera(), labels).read_labels(), np.where(LABELS == 2, UNKNOWN, LABELS))
+
+
 def test_labels_in_memory_are_checked_at_once() -> None:
     with pytest.raises(MaskSizeError, match=r"view 'a': mask is 4 x 6 pixels; expected 6 x 4, the size of camera 'a'"):
         View.from_arrays(camera(), LABELS.T)
