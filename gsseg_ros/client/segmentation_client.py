@@ -32,13 +32,8 @@ from gsseg_ros.client.results import (
 )
 from gsseg_ros.client.run_clouds import RunClouds
 from gsseg_ros.client.scene_requests import SceneRequests
-from gsseg_ros.conversions import (
-    arrays_from_cloud,
-    labels_from_image,
-    mask_image,
-    picture_from_image,
-    viewpoint_messages,
-)
+from gsseg_ros.cloud_messages import arrays_from_cloud
+from gsseg_ros.conversions import labels_from_image, mask_image, picture_from_image, viewpoint_messages
 from gsseg_ros.object_messages import box_from_object
 from gsseg_ros.qos import FEEDBACK_DEPTH, reliable
 

@@ -22,7 +22,8 @@ from gsseg_core.viewer.live_source import LiveUpdate
 from gsseg_core.viewer.model import Labelling
 from gsseg_ros.client.calls import Calls
 from gsseg_ros.client.spinner import Spinner
-from gsseg_ros.conversions import CloudArrays, arrays_from_cloud, stamp_ns
+from gsseg_ros.cloud_messages import CloudArrays, arrays_from_cloud
+from gsseg_ros.conversions import stamp_ns
 from gsseg_ros.errors import NodeUnavailableError, SegmentationError
 from gsseg_ros.frames import Similarity
 from gsseg_ros.qos import latched

@@ -21,7 +21,7 @@ from gsseg_core.live.session import LiveSession
 from gsseg_core.objects.occupied_cells import OPAQUE, occupied_cells
 from gsseg_core.refine.settings import PAPER
 from gsseg_core.scene.quaternions import half_axes
-from gsseg_ros.conversions import points_cloud
+from gsseg_ros.cloud_messages import points_cloud
 from gsseg_ros.node.complaints import OBSTACLES, Complaints
 from gsseg_ros.node.parameters import Settings
 from gsseg_ros.node.sim_time import steady_timer

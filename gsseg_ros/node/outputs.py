@@ -20,7 +20,7 @@ from sensor_msgs.msg import Image, PointCloud2
 from std_msgs.msg import Header
 from visualization_msgs.msg import MarkerArray
 
-from gsseg_ros.conversions import cloud
+from gsseg_ros.cloud_messages import cloud
 from gsseg_ros.node.masks.label_info import label_info, label_info_class
 from gsseg_ros.node.reports import Selection
 from gsseg_ros.object_messages import object_markers

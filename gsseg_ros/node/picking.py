@@ -19,7 +19,8 @@ from gsseg_core.objects.oriented_boxes import class_box
 from gsseg_core.scene.camera import Camera
 from gsseg_core.scene.gaussian_scene import GaussianScene
 from gsseg_ros.camera_infos import camera_of_image, image_size
-from gsseg_ros.conversions import byte_array, cloud, require_size
+from gsseg_ros.cloud_messages import cloud
+from gsseg_ros.conversions import byte_array, require_size
 from gsseg_ros.errors import InvalidRequestError, TooManyPixelsError, ViewpointError
 from gsseg_ros.frames import Similarity
 from gsseg_ros.node.masks.reader import read_image

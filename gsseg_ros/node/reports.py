@@ -19,7 +19,7 @@ from gsseg_core.objects.oriented_boxes import class_box
 from gsseg_core.refine.settings import RefineSettings
 from gsseg_core.scene.gaussian_scene import GaussianScene
 from gsseg_core.segmentation import Segmentation
-from gsseg_ros.conversions import CLOUD_POINT, cloud_of_records, fill_records
+from gsseg_ros.cloud_messages import CLOUD_POINT, cloud_of_records, fill_records
 from gsseg_ros.frames import Similarity
 from gsseg_ros.node.workspace import Run
 from gsseg_ros.object_messages import color_message, object_message, point_message

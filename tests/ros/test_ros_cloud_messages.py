@@ -16,7 +16,7 @@ from ros_message_cases import HEADER, as_bytes, refusal
 from sensor_msgs.msg import PointCloud2, PointField
 
 from gsseg_core.errors import SceneValueError
-from gsseg_ros.conversions import arrays_from_cloud, cloud
+from gsseg_ros.cloud_messages import arrays_from_cloud, cloud
 
 
 @st.composite
@@ -85,7 +85,7 @@ def test_a_million_points_are_converted_at_once_even_where_rclpy_checks_fields()
         import numpy as np
         from sensor_msgs.msg import PointCloud2
         from std_msgs.msg import Header
-        from gsseg_ros.conversions import arrays_from_cloud, cloud
+        from gsseg_ros.cloud_messages import arrays_from_cloud, cloud
 
         points, ones = np.ones((1_000_000, 3), np.float32), np.ones(1_000_000, np.int32)
         header, rgb = Header(), np.ones((1_000_000, 3), np.uint8)

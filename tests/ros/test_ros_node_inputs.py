@@ -21,7 +21,8 @@ from gsseg_core.refine.settings import UNREFINED
 from gsseg_core.scene.gaussian_scene import GaussianScene
 from gsseg_core.segmentation import Segmentation
 from gsseg_ros.camera_infos import camera_of_image
-from gsseg_ros.conversions import arrays_from_cloud, mask_image, pose_from_matrix, stamp_message
+from gsseg_ros.cloud_messages import arrays_from_cloud
+from gsseg_ros.conversions import mask_image, pose_from_matrix, stamp_message
 from gsseg_ros.frames import Similarity
 
 

@@ -22,7 +22,8 @@ from gsseg_core.objects.oriented_boxes import class_box
 from gsseg_core.objects.pick import Pick, pick_clicks, pick_mask
 from gsseg_core.scene.gaussian_scene import GaussianScene
 from gsseg_ros.camera_infos import camera_of_image
-from gsseg_ros.conversions import arrays_from_cloud, mask_image
+from gsseg_ros.cloud_messages import arrays_from_cloud
+from gsseg_ros.conversions import mask_image
 from gsseg_ros.frames import Similarity
 from gsseg_ros.node import segment_node
 from gsseg_ros.object_messages import box_from_object

@@ -21,7 +21,8 @@ from gsseg_core.raster.backends import make_operator
 from gsseg_core.refine.settings import PAPER, RefineSettings
 from gsseg_core.scene.gaussian_scene import GaussianScene
 from gsseg_core.segmentation import REMOVED, Segmentation
-from gsseg_ros.conversions import arrays_from_cloud, labels_from_image
+from gsseg_ros.cloud_messages import arrays_from_cloud
+from gsseg_ros.conversions import labels_from_image
 from gsseg_ros.node.request_fields import refinement
 
 

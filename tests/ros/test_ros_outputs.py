@@ -28,7 +28,7 @@ from std_msgs.msg import Header
 from gsseg_core.export.pictures import palette
 from gsseg_core.live.session import LiveSession
 from gsseg_core.refine.settings import PAPER
-from gsseg_ros.conversions import arrays_from_cloud
+from gsseg_ros.cloud_messages import arrays_from_cloud
 from gsseg_ros.frames import Similarity
 from gsseg_ros.node import outputs as outputs_module
 from gsseg_ros.node.outputs import Outputs

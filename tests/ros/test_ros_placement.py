@@ -34,7 +34,8 @@ from gsseg_core.scene.gaussian_scene import GaussianScene
 from gsseg_core.scene.group_frames import is_same
 from gsseg_core.scene.scene_delta import GroupMove, SceneDelta
 from gsseg_core.scene.similarity import Similarity as CoreSimilarity
-from gsseg_ros.conversions import arrays_from_cloud, viewpoint_messages
+from gsseg_ros.cloud_messages import arrays_from_cloud
+from gsseg_ros.conversions import viewpoint_messages
 from gsseg_ros.delta_messages import message_from_delta
 from gsseg_ros.errors import BusyError
 from gsseg_ros.frames import Similarity

@@ -24,7 +24,7 @@ from gsseg_core.segmentation import REMOVED, UNOBSERVED, Segmentation
 from gsseg_core.viewer.live_source import LiveUpdate, open_source
 from gsseg_ros.client import NodeUnavailableError, SegmentationClient
 from gsseg_ros.client.view_source import RosSource, _Places
-from gsseg_ros.conversions import CloudArrays
+from gsseg_ros.cloud_messages import CloudArrays
 from gsseg_ros.errors import SegmentationError
 from gsseg_ros.frames import Similarity
 from gsseg_ros.node.diagnostics import diagnostic_array
