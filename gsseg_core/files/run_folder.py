@@ -181,7 +181,7 @@ class StagedRun:
                 _finish(self.out)
         except OSError as error:
             raise WriteError(
-                f"{self.out}: cannot be written ({error.strerror or error}); what was there before is unchanged"
+                f"{self.out}: cannot be written ({reason(error)}); what was there before is unchanged"
             ) from error
 
     def close(self) -> None:
@@ -238,7 +238,7 @@ def _finish(out: Path) -> None:
         sync_folder(out)
     except OSError as error:
         raise WriteError(
-            f"{out}: its new results are complete, but not all are in their places ({error.strerror or error}); the "
+            f"{out}: its new results are complete, but not all are in their places ({reason(error)}); the "
             "next command of gsseg that reads or writes this folder moves them"
         ) from error
     shutil.rmtree(staging, ignore_errors=True)
@@ -249,7 +249,7 @@ def _read_commit(path: Path) -> Manifest:
         return Manifest.read(path)
     except OSError as error:
         raise WriteError(
-            f"{path}: cannot be read ({error.strerror or error}), so a run that was cut short is not finished; "
+            f"{path}: cannot be read ({reason(error)}), so a run that was cut short is not finished; "
             "expected that who began it runs gsseg on this folder once more"
         ) from error
 

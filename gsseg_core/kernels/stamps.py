@@ -25,9 +25,9 @@ def stamp_of(kernel: Callable[..., Any]) -> bytes:
     """Hash all that a kernel may be compiled from, when it is defined: files, and numbers that come from others.
 
     The files are that of its module, those of all modules with compiled code that this imports, directly or not, and
-    those here by which all are compiled.
-    Other modules give it numbers and the fields of tuples, which count by their values: to change the reader of a
-    format compiles nothing anew. Imports inside functions do not count, since kernels have none.
+    those here by which all are compiled. Other modules give it numbers and the fields of tuples, which count by their
+    values: to change the reader of a format compiles nothing anew. Imports inside functions do not count, since kernels
+    have none.
     """
     module = kernel.__module__
     return _stamp(module, Path(kernel.__code__.co_filename).parents[module.count(".")])
