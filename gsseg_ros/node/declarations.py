@@ -216,3 +216,7 @@ def declare(node: Node) -> None:
         flags = {"read_only": declaration.at_start, "dynamic_typing": declaration.any_type}
         described = parameter_descriptor(text, declaration.default, *limits, **flags)
         node.declare_parameter(declaration.name, default, described)
+    lists = [declaration.name for declaration in DECLARATIONS if declaration.default == []]
+    unset = [name for name in lists if node.get_parameter_or(name).value is None]
+    # Who asks for all parameters, as `ros2 param dump` does, is told none if one of them has no value.
+    node.set_parameters([Parameter(name, Parameter.Type.STRING_ARRAY, []) for name in unset])

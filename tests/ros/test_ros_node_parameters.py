@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
+import functools
 import json
 from pathlib import Path
 from typing import Any
 
 import pytest
+import yaml
 from rcl_interfaces.msg import Parameter as ParameterMessage
 from rcl_interfaces.msg import ParameterType
-from rclpy.parameter import Parameter, get_parameter_value
+from rclpy.parameter import Parameter, get_parameter_value, parameter_value_to_python
 from ros_fixtures import idle_fixture, idle_robot_fixture, parameters_fixture, root_fixture, shared_fixture  # noqa: F401
 from ros_helpers import REPOSITORY, Ros, ros_fixture  # noqa: F401
 from ros_robot import CLASSES, Robot
@@ -242,6 +244,31 @@ def test_parameters_come_from_a_file(ros: Ros, parameters: dict[str, Any], tmp_p
     found = {name: robot.get(name) for name in wanted}
     assert {name: list(v) if isinstance(wanted[name], list) else v for name, v in found.items()} == wanted
     robot.wait_for_status(lambda status: status.get("classes") == "5", "five classes")
+
+
+def test_all_parameters_can_be_dumped_at_once_and_a_node_that_is_given_them_has_the_same(
+    ros: Ros, root: Path, tmp_path: Path
+) -> None:
+    def dumped(robot: Robot) -> dict[str, Any]:
+        names = sorted(robot.ask("list_parameters").result.names)
+        values = robot.ask("get_parameters", names=names).values
+        assert len(values) == len(names), "one without a value hides all others"
+        found = zip(names, map(parameter_value_to_python, values), strict=True)
+        return {name: value if isinstance(value, bool | int | float | str) else list(value) for name, value in found}
+
+    first = Robot(ros)
+    first.start({"data_root": root, "autostart": False, "k": 44}).wait_for("autostart is false")
+    found, tree = dumped(first), {}
+    assert found["k"] == 44 and {found[name] == [] for name in ("class_names", "palette", "cameras")} == {True}
+    for name, value in found.items():  # As `ros2 param dump` has it.
+        *above, last = name.split(".")
+        functools.reduce(lambda part, key: part.setdefault(key, {}), above, tree)[last] = value
+    (tmp_path / "dump.yaml").write_text(yaml.dump({"/gsseg": {"ros__parameters": tree}}))
+    assert first.process is not None and first.process.stop() == 0
+    again = Robot(ros)
+    again.process = ros.start("segment_node", None, "--params-file", str(tmp_path / "dump.yaml"))
+    again.process.wait_for("autostart is false")
+    assert dumped(again) == found
 
 
 def test_parameters_of_ros_itself_may_change_without_a_look_at_those_of_the_node(
