@@ -77,6 +77,8 @@ class SegmentNode(LifecycleNode):
                 service.callback = self._answered(service.callback)
         self.configuring = False
         declarations.declare(self)
+        if passed_over := declarations.passed_over(self):
+            self.get_logger().warning(passed_over)
         self.workspace = Workspace(Settings.read(self), lambda: self.get_clock().now().to_msg())
         self.inputs: Inputs | None = None
         self.obstacles: Obstacles | None = None

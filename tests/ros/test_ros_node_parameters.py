@@ -271,6 +271,15 @@ def test_all_parameters_can_be_dumped_at_once_and_a_node_that_is_given_them_has_
     assert dumped(again) == found
 
 
+def test_parameters_that_the_node_does_not_have_are_named_with_those_that_were_meant(ros: Ros) -> None:
+    process = ros.start("segment_node", {"autostart": False, "max_view": 10, "controller.rate": 5.0, "k": 44})
+    process.wait_for("autostart is false")
+    assert (
+        "[gsseg]: parameters that this node does not have are passed over: controller.rate, max_view (did you mean "
+        "max_views?)\n" in process.output
+    )
+
+
 def test_parameters_of_ros_itself_may_change_without_a_look_at_those_of_the_node(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
