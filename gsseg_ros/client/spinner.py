@@ -12,10 +12,19 @@ from rclpy.context import Context
 from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
 from rclpy.node import Node
 
+from gsseg_core.text import one_line
+from gsseg_ros.enduring_executor import EnduringExecutor
+
 T = TypeVar("T")
 
 TURN_SECONDS = 0.1
 """How long a turn of the thread lasts at most; what is waited for is looked at after every turn."""
+
+
+class _Executor(EnduringExecutor, SingleThreadedExecutor):
+    def _complain(self, what: str, error: Exception) -> None:
+        (node,) = self.get_nodes()
+        node.get_logger().error(one_line(f"{what}: {type(error).__name__}: {error}"))
 
 
 class Spinner:
@@ -36,7 +45,7 @@ class Spinner:
         self.node = Node(
             name, context=self._context, use_global_arguments=False, enable_rosout=False, start_parameter_services=False
         )
-        self._executor = SingleThreadedExecutor(context=self._context)
+        self._executor = _Executor(context=self._context)
         self._executor.add_node(self.node)
         self._turned = threading.Condition()
         self._closing = self._ended = False
