@@ -19,6 +19,11 @@ _MOST = 16
 """Clouds that are kept; of two that ask in turn, and never rest together, all would be."""
 
 
+def was_published(report: SegmentationReport) -> bool:
+    """Whether a run was: one that others replaced, or got ahead of, is answered all the same."""
+    return any(stage.name == "publish" for stage in report.stages)
+
+
 class RunClouds:
     """Listens to a node's `~/cloud`, whose full name is `topic`; its methods may be called from several threads."""
 
@@ -45,11 +50,10 @@ class RunClouds:
     def of_run(self, report: SegmentationReport, deadline: float) -> PointCloud2 | None:
         """Wait for the cloud of a run; None if it was not published, or that of a later one has come instead.
 
-        A run that others replaced, or got ahead of, is answered all the same; its report has no stage "publish". Raises
-        `NodeUnavailableError`: neither has come by the deadline (s, `time.monotonic`).
+        Raises `NodeUnavailableError`: neither has come by the deadline (s, `time.monotonic`).
         """
         stamp = stamp_ns(report.header.stamp)
-        if all(stage.name != "publish" for stage in report.stages) and time.monotonic() < deadline:
+        if not was_published(report) and time.monotonic() < deadline:
             return None
         if not self._spinner.wait_for(lambda: max([*self._clouds, -1]) >= stamp, deadline - time.monotonic()):
             publishers = self._spinner.node.count_publishers(self._topic.topic_name)

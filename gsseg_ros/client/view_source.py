@@ -21,6 +21,7 @@ from gsseg_core.segmentation import UNOBSERVED
 from gsseg_core.viewer.live_source import LiveUpdate
 from gsseg_core.viewer.model import Labelling
 from gsseg_ros.client.calls import Calls
+from gsseg_ros.client.run_clouds import was_published
 from gsseg_ros.client.spinner import Spinner
 from gsseg_ros.cloud_messages import CloudArrays, arrays_from_cloud
 from gsseg_ros.conversions import stamp_ns
@@ -96,6 +97,8 @@ class RosSource:
                 f"{self._name} has the scene {report.scene_path}, which is not {self._scene.path or 'this one'}; "
                 "expected the same file"
             )
+        if not was_published(report):  # There is something newer to ask for.
+            return None
         try:
             labelling = self._labelling(report, before)
         except StateMismatchError:  # The scene may have been put elsewhere in the map.

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 from builtin_interfaces.msg import Time
+from gsseg_msgs.msg import StageTiming
 from labellings import probabilities_of
 from patience import PATIENCE
 from ros_helpers import Ros, ros_fixture, wait_until  # noqa: F401
@@ -30,6 +31,9 @@ from gsseg_ros.frames import Similarity
 from gsseg_ros.node.diagnostics import diagnostic_array
 
 MOVED = {"scene_to_map.scale": 2.0, "scene_to_map.translation": [1.0, -2.0, 0.5]}
+
+
+PUBLISHED = [StageTiming(name="publish")]
 
 
 def next_update(source: RosSource) -> LiveUpdate:
@@ -120,7 +124,7 @@ def source_of(scene: GaussianScene, said: str, answer: Any, place: Similarity) -
 def test_a_scene_that_the_node_puts_elsewhere_is_found_there() -> None:
     scene, _ = many_classes(30)
     mug = SimpleNamespace(class_id=1, name="mug", topic="")
-    report = SimpleNamespace(scene_hash=scene.digest, classes=[mug], num_views=3, header=Header())
+    report = SimpleNamespace(scene_hash=scene.digest, classes=[mug], num_views=3, header=Header(), stages=PUBLISHED)
     source = source_of(
         scene, "3 views", report, Similarity.from_parameters(2.0, [1.0, -2.0, 0.5], [0.0, 0.0, 0.0, 1.0])
     )
@@ -142,12 +146,22 @@ def test_a_node_whose_map_is_another_one_by_now_is_not_asked_again_before_anythi
 
 def test_a_class_that_turned_up_in_a_run_for_somebody_else_is_shown() -> None:
     scene, _ = many_classes(30)
-    report = SimpleNamespace(scene_hash=scene.digest, classes=[], num_views=3, header=Header())
+    report = SimpleNamespace(scene_hash=scene.digest, classes=[], num_views=3, header=Header(), stages=PUBLISHED)
     source = source_of(scene, "3 views", report, Similarity())
     update = source.wait(0.1)
     assert update is not None and probabilities_of(update.labelling).shape == (len(scene), 2)
     assert np.flatnonzero(probabilities_of(update.labelling)[:, 1]).tolist() == [0, 1]
     assert update.labelling.class_names[1] == "class_01"
+
+
+def test_a_run_that_was_not_published_is_not_waited_for_but_asked_for_again() -> None:
+    scene, _ = many_classes(30)
+    report = SimpleNamespace(scene_hash=scene.digest, classes=[], num_views=3, header=Header(), stages=[])
+    source: Any = source_of(scene, "3 views", report, Similarity())
+    waiting, source._cloud = source._cloud, lambda *_: pytest.fail("it waits for a cloud that does not come")
+    assert source.wait(0.1) is None
+    report.stages, source._cloud = PUBLISHED, waiting
+    assert source.wait(0.1) is not None and source.wait(0.1) is None
 
 
 def test_when_the_node_has_forgotten_all_nothing_is_known_any_more() -> None:
