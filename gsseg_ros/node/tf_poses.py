@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import threading
+import time
 from collections import defaultdict, deque
 from typing import Any
 
@@ -15,6 +16,7 @@ from gsseg_ros.node.pose_sources import PoseSource
 from gsseg_ros.node.timeline import BEHIND_NS
 
 _BEHIND_KEPT = 2000  # Transforms of a frame; at 200 Hz, those of ten seconds.
+_PROBLEMS_KEPT, _LONG_AGO_S = 16, 10.0
 _UNDER_WAY = 100  # Transforms from before time was set back that may come after it: as deep as tf2_ros subscribes.
 
 
@@ -36,7 +38,8 @@ class TfPoses(PoseSource):
                 f"parameter pose_source is 'tf', but TF cannot be used here ({error}); expected the apt package "
                 "ros-jazzy-tf2-ros-py to be installed, or pose_source 'topic' or 'odometry'"
             ) from error
-        self.problem = ""  # why the last lookup found nothing; empty if it found a pose
+        # By frame, and frame within which: when (s, `time.monotonic`) and why the last lookup of it found nothing.
+        self._problems: dict[tuple[str, str], tuple[float, str]] = {}
         self._map_frame = map_frame
         self._buffer = Buffer()
         self._heard = _Heard(self._buffer)
@@ -52,6 +55,12 @@ class TfPoses(PoseSource):
         except SettingsError:
             return None
 
+    @property
+    def problem(self) -> str:
+        """Why the newest lookup failed that has not succeeded since; empty if there is none, or it was long ago."""
+        when, why = [(0.0, ""), *self._problems.values()][-1]
+        return why if time.monotonic() - when < _LONG_AGO_S else ""
+
     def listen(self) -> None:
         """Begin to listen, if it does not yet."""
         with self._listening:
@@ -63,7 +72,8 @@ class TfPoses(PoseSource):
         """Look up the pose (4, 4) of `frame_id` in the map frame at `stamp` (ns); None if TF does not know it (yet)."""
         if stamp <= 0 or not frame_id:
             # To TF a stamp of zero means "the latest", which belongs to another image.
-            self.problem = f"a mask has the stamp {stamp} and the frame_id '{frame_id}'; expected both to be filled in"
+            why = f"a mask has the stamp {stamp} and the frame_id '{frame_id}'; expected both to be filled in"
+            self._note(frame_id, self._map_frame, why)
             return None
         return self.look_up(frame_id, stamp)
 
@@ -78,10 +88,17 @@ class TfPoses(PoseSource):
             found = self._buffer.lookup_transform(within, frame_id, self._time(nanoseconds=stamp))
             pose = matrix_from_transform(found.transform, f"TF from '{frame_id}' to '{within}'")
         except (self._not_found, GssegError) as error:
-            self.problem = str(error)
+            self._note(frame_id, within, str(error))
             return None
-        self.problem = ""
+        self._problems.pop((frame_id, within), None)
         return pose
+
+    def _note(self, frame_id: str, within: str, why: str) -> None:
+        """Note why a lookup failed: those of other cameras, and of the rest of a chain, may succeed all the same."""
+        self._problems.pop((frame_id, within), None)
+        self._problems[frame_id, within] = time.monotonic(), why
+        for oldest in list(self._problems)[:-_PROBLEMS_KEPT]:
+            self._problems.pop(oldest, None)
 
     def set_back(self, before: int, began: int) -> None:
         """Forget the transforms from before time was set back from `before` to `began` (ns), but not the static ones.

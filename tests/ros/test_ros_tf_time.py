@@ -136,3 +136,18 @@ def test_a_frame_that_begins_late_in_a_round_is_not_taken_for_one_of_before(tf: 
     for stamp, child in ((1 * S, "base"), (15 * S, "base"), (15 * S, "arm")):
         listener.set_transform(transform(stamp, 2.0, child), "")
     assert transforms.look_up("arm", 15 * S) is not None
+
+
+def test_why_a_transform_is_missing_is_kept_while_others_are_found(tf: tuple[TfPoses, Any]) -> None:
+    """Of a chain of which one link has stopped, and of two cameras of which TF knows one."""
+    transforms, listener = tf
+    listener.set_transform(transform(1 * S, 1.0, "camera"), "")
+    assert PoseFrames("map", transforms).camera_in_map(GivenPose(pose(0.0), "odom", "base"), 1 * S, "camera") is None
+    assert transforms.problem == "lookup would require extrapolation"
+    listener.set_transform(transform(1 * S, 1.0, "odom"), "")
+    assert transforms.look_up("odom", 1 * S) is not None and transforms.problem == ""
+    for number in range(100):
+        assert transforms.at(0, f"camera{number}") is None
+        assert transforms.at(1 * S, "camera") is not None
+        assert transforms.problem.startswith(f"a mask has the stamp 0 and the frame_id 'camera{number}'")
+    assert len(transforms._problems) < 20
