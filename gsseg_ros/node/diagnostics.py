@@ -162,7 +162,7 @@ def _negative_stamps(inputs: Inputs) -> str:
 def _frame_problem(inputs: Inputs) -> str:
     for camera in inputs.cameras.values():
         mask, infos = camera.pairing.unmatched_frame, camera.pairing.camera_frames
-        if infos and not {mask, ""} & set(infos):
+        if mask is not None and infos and not {mask, ""} & set(infos):
             known = ", ".join(map(repr, infos))
             return f" (masks have the frame_id '{mask}', camera_infos have {known}: expected the same)"
     return ""

@@ -92,7 +92,7 @@ class Pairing:
         # "negative_stamp", and "time_jump" for one from before time was set back that came after it.
         self.dropped: Counter[str] = Counter()
         self.out_of_order = 0  # masks that were older than one before them; they are paired all the same
-        self.unmatched_frame = ""  # frame_id of the last mask that was dropped for want of a camera_info
+        self.unmatched_frame: str | None = None  # frame_id of the last mask that was dropped for want of a camera_info
         self.negative_stamp = 0  # that of the last mask that was dropped for it, ns
         self._poses = poses
         self._prefix, self._stream = prefix, stream

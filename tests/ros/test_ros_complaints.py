@@ -15,6 +15,8 @@ from rclpy.time import Time
 from gsseg_core.live import results as live_results
 from gsseg_ros.node import diagnostics
 from gsseg_ros.node.complaints import KINDS, REASONS, REFUSED_POSE, Complaints
+from gsseg_ros.node.pairing import Pairing
+from gsseg_ros.node.pose_sources import MessagePoses
 from gsseg_ros.node.sim_time import SimTime, on_set_back
 
 SECOND = 1_000_000_000
@@ -247,6 +249,15 @@ def test_every_way_to_lose_a_mask_is_in_the_verdict_and_in_the_log(
         hears.verdict()
     assert [line.split(" because ")[0] for line in hears.lines] == ["5 masks were dropped", "10 masks were dropped"]
     assert all(said in line for line in hears.lines)
+
+
+def test_of_several_cameras_that_one_is_named_whose_masks_have_another_frame(hears: Hears) -> None:
+    fine = SimpleNamespace(**vars(hears.pairing) | {"unmatched_frame": Pairing(MessagePoses()).unmatched_frame})
+    fine.camera_frames = ["front"]
+    front = SimpleNamespace(name="front", accepted=0, pairing=fine, topic=lambda role: f"front/{role}")
+    hears.inputs.cameras = {"front": front} | hears.inputs.cameras
+    hears.inputs.dropped["no_camera_info"] = 3
+    assert "(masks have the frame_id 'left', camera_infos have 'right': expected the same)" in hears.verdict()[1]
 
 
 def test_a_refused_change_of_the_scene_is_in_the_verdict_for_five_seconds(steady: Steady, hears: Hears) -> None:
