@@ -38,6 +38,11 @@ def robot(running: Robot) -> Robot:
     return running
 
 
+def status_after_reset(robot: Robot) -> dict[str, str]:
+    """What the node says once it is active; just before, it has a scene without views, and no inputs to tell of."""
+    return robot.wait_for_status(lambda said: said.get("views fused") == "0" and "time jumps" in said, "the reset")
+
+
 def learnt(robot: Robot, name: str) -> Segmentation:
     """The codes of the node as they are now."""
     return robot.exported(robot.out(name), skip_refinement=True)
@@ -140,7 +145,7 @@ def test_a_camera_info_of_before_serves_masks_that_have_none_of_their_own(robot:
 
 
 def test_views_out_of_order_are_fused_and_counted(robot: Robot, scene: GaussianScene) -> None:
-    before = robot.wait_for_status(lambda status: status.get("views fused") == "0", "the reset")
+    before = status_after_reset(robot)
     views, start = clean_views(3), robot.next_stamp()
     for view, late in zip(views, (0, 4, 2), strict=True):
         robot.publish(messages(view, start + late * STEP))
@@ -152,7 +157,7 @@ def test_views_out_of_order_are_fused_and_counted(robot: Robot, scene: GaussianS
 
 
 def test_a_bag_that_loops_is_fused_again(robot: Robot, scene: GaussianScene) -> None:
-    before = robot.wait_for_status(lambda status: status.get("views fused") == "0", "the reset")
+    before = status_after_reset(robot)
     views, start = clean_views(4), robot.next_stamp()
     stamps = [start + i * SECOND for i in range(4)]
     for loop in range(2):
@@ -170,7 +175,7 @@ def test_a_bag_that_loops_is_fused_again(robot: Robot, scene: GaussianScene) -> 
 def test_synchronised_cameras_whose_poses_cannot_be_told_apart_are_refused_and_diagnostics_say_what_to_do(
     robot: Robot,
 ) -> None:
-    before = robot.wait_for_status(lambda status: status.get("views fused") == "0", "the reset")
+    before = status_after_reset(robot)
     refused = int(before.get("rejected several_cameras", 0))
     views = clean_views(2)
     for i in range(3):
