@@ -35,6 +35,11 @@ def composed(name: str) -> str:
     return unicodedata.normalize("NFC", name)
 
 
+def searched(text: str) -> str:
+    """Write a name, or what is searched for in names, in large letters: ß is SS then, and any i of Turkish an I."""
+    return composed(text.upper()).replace("\u0130", "I")
+
+
 def clipped(value: object, most: int = 80) -> str:
     """Give a foreign name or value as it goes into a message or a table: printable, and not long."""
     text = str(value)

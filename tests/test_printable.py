@@ -9,7 +9,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from gsseg_core.errors import GssegError, SceneFileError
-from gsseg_core.text import one_line, printable
+from gsseg_core.text import one_line, printable, searched
 
 
 @pytest.mark.parametrize(
@@ -57,3 +57,17 @@ def test_an_error_about_any_name_is_one_short_line_that_ends_with_what_was_wrong
     shown = str(SceneFileError(f"{name}: does not exist"))
     assert shown.isprintable() and len(shown) <= 1000 and shown.endswith(": does not exist")
     assert str(GssegError(shown)) == shown == one_line(shown)
+
+
+@pytest.mark.parametrize(
+    ("typed", "name"),
+    [
+        ("t\u00fcr", "Tu\u0308r"),
+        ("istanbul", "\u0130stanbul"),
+        ("I\u015eIK", "\u0131\u015f\u0131k"),
+        ("STRASSE", "Stra\u00dfe"),
+    ],
+)
+def test_what_is_searched_for_is_found_though_its_letters_are_small_or_large(typed: str, name: str) -> None:
+    assert searched(typed) == searched(name)
+    assert searched("isik") not in searched("\u0131\u015f\u0131k"), "an accent makes another letter"

@@ -1,8 +1,9 @@
 // The 3D preview of report.html: Gaussians as opaque elliptic discs, WebGL 2, no library.
 // Without WebGL 2 it leaves the page as it is, with a picture in the preview's place.
 "use strict";
-// Names that look alike are alike, though accents may be characters of their own, as macOS writes them.
-const plain = (text) => text.normalize("NFC").toLowerCase();
+// Names that look alike are alike, though accents may be characters of their own, as macOS writes them. In large letters
+// ß is SS, and any i of Turkish an I.
+const plain = (text) => text.toUpperCase().normalize("NFC").replaceAll("\u0130", "I");
 for (const field of document.querySelectorAll(".search")) {
   field.hidden = false;
   field.addEventListener("input", () => {

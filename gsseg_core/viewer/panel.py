@@ -16,7 +16,7 @@ from gsseg_core.errors import GssegError, SettingsError
 from gsseg_core.export.collision import KINDS
 from gsseg_core.scene.camera import Camera
 from gsseg_core.scene.scene_writers import SCENE_WRITERS
-from gsseg_core.text import composed, counted, printable
+from gsseg_core.text import counted, printable, searched
 from gsseg_core.viewer.answer import LONGEST_NAME, Answer, label_name, paragraph, shown_name
 from gsseg_core.viewer.corrections import box, disc, looks_alike, region
 from gsseg_core.viewer.model import MODES, ClassRow, ViewModel
@@ -195,8 +195,9 @@ class Panel:
     def _filter(self) -> None:
         """List only the classes whose name has what is searched for."""
         with self._state.lock:
+            wanted = searched(self._search.value.strip())
             for row, button in self._rows.values():
-                button.visible = composed(self._search.value.strip().lower()) in composed(row.name.lower())
+                button.visible = wanted in searched(row.name)
 
     def _on(self, register: Callable[[Callable[[Any], None]], object], action: Callable[[Event], object]) -> None:
         """Have a widget call an action, `register` being its `on_click` or `on_update`; errors are told."""

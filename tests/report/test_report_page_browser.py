@@ -39,6 +39,7 @@ def long_report(tmp_path_factory: pytest.TempPathFactory) -> str:
     """Address of a page of more classes than fit on it one by one, some of them under very long names."""
     folder, (scene, truth) = tmp_path_factory.mktemp("long"), many_classes(24)
     long = {4: "x" * 200, 5: "a thing on the table " * 9, 6: "\u05e9" * 9, 7: "object_007", 8: "Tu\u0308r"}
+    long |= {9: "\u0130stanbul \u0131\u015f\u0131kl\u0131", 10: "Stra\u00dfe"}
     names = {k: f"class {k}" for k in range(24)} | NASTY | long
     cameras = [look_at(f"view{i}", np.array([0.1 * i, -0.9, 1.5]), 160, 120, 90.0) for i in range(4)]
     data = write_dataset(folder / "data", scene, truth, cameras, names)
@@ -180,9 +181,12 @@ def test_long_names_and_many_classes_break_no_figure_and_make_no_page_wider(
         assert whole, "the names that objects get are told apart by their end"
 
 
-def test_a_search_finds_letters_whose_accents_are_characters_of_their_own(page: Page, long_report: str) -> None:
+@pytest.mark.parametrize("typed", ["t\u00fcr", "istanbul", "I\u015eIKLI", "\u0130stanbul", "strasse", "STRA\u00dfE"])
+def test_a_search_finds_letters_however_they_are_written_small_or_large(
+    page: Page, long_report: str, typed: str
+) -> None:
     page.goto(long_report)
-    page.locator("#classes .search").fill("t\u00fcr")
+    page.locator("#classes .search").fill(typed)
     assert page.locator("#classes tbody tr:visible").count() == 1
 
 
