@@ -63,13 +63,22 @@ def _stays(character: str) -> bool:
 def table(header: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
     """Lay out rows in columns: the first flush left, the others flush right; long cells are shortened."""
     lines = [[clipped(cell, 60) for cell in row] for row in (header, *rows)]
-    widths = [max(len(line[i]) for line in lines) for i in range(len(header))]
+    widths = [max(_width(line[i]) for line in lines) for i in range(len(header))]
     lines.insert(1, ["-" * width for width in widths])
     laid_out = []
-    for first, *others in lines:
-        cells = [cell.rjust(width) for cell, width in zip(others, widths[1:], strict=True)]
-        laid_out.append("  ".join([first.ljust(widths[0]), *cells]))
+    for line in lines:
+        gaps = [" " * (width - _width(cell)) for cell, width in zip(line, widths, strict=True)]
+        flush_right = [gap + cell for gap, cell in zip(gaps, line, strict=True)]
+        laid_out.append("  ".join([line[0] + gaps[0], *flush_right[1:]]))
     return "\n".join(laid_out)
+
+
+def _width(text: str) -> int:
+    """Columns of a terminal that a text takes: a letter of East Asia or an emoji two, what joins its neighbour none."""
+    return sum(
+        0 if unicodedata.category(c) in ("Mn", "Me", "Cf") else 2 if unicodedata.east_asian_width(c) in "WF" else 1
+        for c in text
+    )
 
 
 def counted(count: int, thing: str, things: str = "") -> str:

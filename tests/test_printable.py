@@ -9,7 +9,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from gsseg_core.errors import GssegError, SceneFileError
-from gsseg_core.text import one_line, printable, searched
+from gsseg_core.text import one_line, printable, searched, table
 
 
 @pytest.mark.parametrize(
@@ -71,3 +71,10 @@ def test_an_error_about_any_name_is_one_short_line_that_ends_with_what_was_wrong
 def test_what_is_searched_for_is_found_though_its_letters_are_small_or_large(typed: str, name: str) -> None:
     assert searched(typed) == searched(name)
     assert searched("isik") not in searched("\u0131\u015f\u0131k"), "an accent makes another letter"
+
+
+def test_columns_of_a_table_stand_below_each_other_though_letters_are_wide_or_join_others() -> None:
+    names = ["chair", "\u6905\u5b50", "\uff21", "Tu\u0308r", "\U0001f4f7\ufe0f", "\ud55c\uad6d\uc5b4"]
+    wide = (0, 2, 1, -1, 0, 3)  # columns that each takes beyond its characters: the selector of an emoji takes none
+    lines = table(["class", "Gaussians"], [[name, "1,234"] for name in names]).split("\n")
+    assert [len(line) + more for line, more in zip(lines[2:], wide, strict=True)] == [len(lines[0])] * len(names)
