@@ -6,6 +6,7 @@ import zlib
 from collections.abc import Mapping, Sequence
 from functools import lru_cache
 from pathlib import Path
+from unicodedata import combining, normalize
 
 import numpy as np
 from PIL import Image, ImageDraw, ImageFont
@@ -194,13 +195,15 @@ def shrunk(image: np.ndarray, px: int) -> np.ndarray:  # (H, W, 3) uint8
 
 
 def _shorten(text: str, font: ImageFont.FreeTypeFont | ImageFont.ImageFont, width: float) -> str:
-    """Cut a text so that it fits into a width in px, with an ellipsis where it was cut."""
-    text = composed(printable(text[:_LONGEST]))  # The font has accented letters, and no accents to put on others.
-    if font.getlength(text) <= width:
-        return text
-    while text and font.getlength(text + "...") > width:
-        text = text[:-1]
-    return text + "..."
+    """Cut a text in its middle so that it fits into a width in px: names are told apart by their end, too."""
+    # The font has ASCII and little more. Letters go without their accents; of those of other scripts there is a box.
+    letters = (c for c in composed(printable(text[:_LONGEST])) if not combining(c))
+    text = shown = "".join(normalize("NFD", c).encode("ascii", "ignore").decode() or c for c in letters)
+    kept = len(text)
+    while kept and font.getlength(shown) > width:
+        kept -= 1
+        shown = f"{text[: (kept + 1) // 2]}...{text[len(text) - kept // 2 :]}"
+    return shown
 
 
 def _looks(rgb: np.ndarray) -> np.ndarray:

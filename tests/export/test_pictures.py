@@ -145,8 +145,18 @@ def test_names_on_pictures_are_written_as_everywhere_else() -> None:
     def drawn(name: str) -> np.ndarray:
         return legend({1: name}, palette(2), np.zeros(2, int))
 
-    np.testing.assert_array_equal(drawn("e\u0301clair"), drawn("\u00e9clair"))  # as macOS writes it
+    for written in ("\u00e9clair", "e\u0301clair"):  # as others write it, and as macOS does
+        np.testing.assert_array_equal(drawn(written), drawn("eclair"), "the font has no accents, and no boxes of them")
     np.testing.assert_array_equal(drawn("exe.\u202egnp"), drawn(r"exe.\u202egnp"))
+
+
+def test_names_that_are_too_long_are_still_told_apart_by_their_beginning_and_by_their_end() -> None:
+    def drawn(caption: str) -> np.ndarray:
+        return contact_sheet([np.zeros((90, 160, 3), np.uint8)], [caption], columns=1)
+
+    name = "2024-05-01_kitchen_scan_left_camera_frame_000123"
+    for other in (name.replace("123", "124"), name.replace("2024", "2023"), f"{name}: 33 % reliable"):
+        assert (drawn(name) != drawn(other)).any(), other
 
 
 def test_a_legend_of_hundreds_of_classes_is_about_as_wide_as_high() -> None:
