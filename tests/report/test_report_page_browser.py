@@ -170,6 +170,11 @@ def test_long_names_and_many_classes_break_no_figure_and_make_no_page_wider(
         const own = name.getBoundingClientRect(), room = name.closest("svg").getBoundingClientRect();
         return own.left < room.left || own.top < room.top || own.right > room.right;
     }).map((name) => name.textContent)"""
+    beside = """() => [...document.querySelectorAll(".classes thead th")].filter((head) => {
+        const range = document.createRange(), next = head.nextElementSibling;
+        range.selectNodeContents(head);
+        return next?.checkVisibility() && range.getBoundingClientRect().right > next.getBoundingClientRect().left;
+    }).map((head) => head.textContent)"""
     with opened_page(chromium, width, 740) as page:
         page.goto(long_report)
         page.wait_for_selector(f"{CANVAS}[data-frames]")
@@ -177,8 +182,12 @@ def test_long_names_and_many_classes_break_no_figure_and_make_no_page_wider(
         assert page.evaluate("document.documentElement.scrollWidth") <= width
         assert page.evaluate(broken) == []
         assert page.evaluate(cut_off) == []
-        whole = page.locator("th.name:has-text('object_007')").evaluate("name => name.scrollWidth <= name.clientWidth")
-        assert whole, "the names that objects get are told apart by their end"
+        page.evaluate("document.querySelector('.legend').classList.add('many')")
+        for names in ("th.name", ".legend bdi"):
+            name = page.locator(f"{names}:has-text('object_007')")
+            whole = name.evaluate("name => name.scrollWidth <= name.clientWidth")
+            assert whole, f"the names that objects get are told apart by their end: {names}"
+        assert page.evaluate(beside) == []
 
 
 @pytest.mark.parametrize("typed", ["t\u00fcr", "istanbul", "I\u015eIKLI", "\u0130stanbul", "strasse", "STRA\u00dfE"])
