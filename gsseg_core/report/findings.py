@@ -136,7 +136,7 @@ def warnings_of(
     if of_ids := grey_ids_of(report) or renamed_ids_of(report, written):
         warnings.append(f"{of_ids[:1].upper()}{of_ids[1:]}.")
     names = dict(enumerate(entry["name"] for entry in report["classes"]))
-    empty = [entry["name"] for entry in report["classes"] if entry["id"] and not entry["gaussians"]]
+    empty = [names.pop(k) for k, entry in enumerate(report["classes"]) if entry["id"] and not entry["gaussians"]]
     if empty and report.get("ids"):
         warnings.append(
             f"{len(empty):,} of {counted(report['ids']['objects'], 'object')} that were found got no Gaussian, as "

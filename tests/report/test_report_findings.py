@@ -126,6 +126,13 @@ def test_each_fault_gets_its_warning(changes: dict[str, object], iou: float, sai
     assert said in warning
 
 
+def test_of_a_class_without_gaussians_it_is_not_said_again_that_masks_do_not_overlap_it() -> None:
+    background = {"id": 0, "name": "background", "gaussians": 0}
+    warnings = warnings_of(minimal_report(classes=[background, CUP, BOX]), np.array([0, 0, 0.3]))
+    assert "1 class got no Gaussian: cup." in warnings and len(warnings) == 2
+    assert warnings[1].endswith("(IoU below 0.5): background, box.")
+
+
 def test_many_names_are_cut_short() -> None:
     views = [{"name": f"v{i}", "reliability": 0.1} for i in range(9)]
     (warning,) = warnings_of(minimal_report(views={"used": 9, "rejected": {}, "reliability": views}), None)
