@@ -27,7 +27,7 @@ MATRIX_CLASSES = 24  # the matrix shows so many of the classes that are confused
 PAIRS = 10
 WORST = 8
 
-_NO_CLASS = {UNOBSERVED: "seen by no mask", REMOVED: "taken out"}
+_NO_CLASS = {UNOBSERVED: "in no mask", REMOVED: "taken out"}
 
 Content = Mapping[str, Any]
 

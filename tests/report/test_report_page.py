@@ -23,7 +23,7 @@ from gsseg_core.report.findings import MaskChecks
 from gsseg_core.report.page import environment, report_page, write_report_page
 from gsseg_core.report.pictures import ViewImages
 from gsseg_core.report.sections import PageInputs, confusion, preview
-from gsseg_core.segmentation import Segmentation
+from gsseg_core.segmentation import REMOVED, Segmentation
 from gsseg_core.text import printable
 
 SCENE, TRUTH = balls_on_a_table()
@@ -200,6 +200,14 @@ def test_any_name_stays_text_in_elements_in_attributes_and_in_json(name: str) ->
     assert "".join(page.said) == printable(name)
     embedded = text.partition("<script>")[2].removesuffix("</script>")
     assert "<" not in embedded and json.loads(embedded) == {"name": name}
+
+
+def test_what_is_said_to_be_taken_out_is_said_of_what_and_how_it_is_drawn(out: Path) -> None:
+    report, (result, checked) = json.loads((out / "report.json").read_text()), segmented()
+    for labels in (np.maximum(result.labels, 0), np.where(result.labels == 1, np.int32(REMOVED), result.labels)):
+        run = PageInputs(report, SCENE, replace(result, labels=labels), checked, ViewImages(SCENE))
+        page = report_page(run)
+        assert (">taken out</bdi>" in page) == ("What refinement took out of its object" in page) == (labels < 0).any()
 
 
 def test_one_class_is_not_called_classes_and_thousands_are_told_apart(out: Path) -> None:
