@@ -14,7 +14,10 @@ for (const field of document.querySelectorAll(".search")) {
     const found = document.querySelectorAll(`${field.dataset.rows}:not([hidden], .elsewhere)`).length;
     field.nextElementSibling.textContent = wanted && `${found} found`;
   });
+  // A page that somebody saved while it was in use has the marks of that, here and below.
+  field.dispatchEvent(new Event("input"));
 }
+document.documentElement.classList.remove("js");
 (() => {
   const canvas = document.querySelector(".stage canvas");
   const say = (text) => document.querySelector("#preview").insertAdjacentText("beforeend", text);
@@ -340,5 +343,7 @@ for (const field of document.querySelectorAll(".search")) {
     say("The browser has lost the preview in 3D. It is there again when the page is loaded anew.");
   });
   look(0);
-  showClasses();
+  modes[0].click();
+  if (levelSlider) showLevel();
+  else showClasses();
 })();

@@ -22,6 +22,7 @@ from gsseg_core.data.label_images import write_mask
 
 if TYPE_CHECKING:
     from collections.abc import Callable
+    from pathlib import Path
 
     from playwright.sync_api import Browser, Locator, Page
 
@@ -281,6 +282,23 @@ def test_a_page_that_one_comes_back_to_shows_what_its_controls_say(opened: Page,
     opened.wait_for_timeout(300)  # A browser puts back what was typed once the page has loaded.
     assert opened.locator(".cut").input_value() == "0" and opened.locator("#classes .search").input_value() == ""
     assert opened.locator(".legend input:not(:checked)").count() == 0
+
+
+def test_a_page_that_was_saved_in_use_begins_anew(chromium: Browser, opened: Page, tmp_path: Path) -> None:
+    opened.locator("[data-mode='2']").click()
+    for section in ("#preview", "#classes"):
+        opened.locator(f"{section} .search").fill("script")
+    (tmp_path / "saved.html").write_text(opened.content(), "utf-8")
+    with opened_page(chromium) as page:
+        page.goto((tmp_path / "saved.html").as_uri())
+        page.wait_for_selector(f"{CANVAS}[data-frames='1']")
+        assert page.locator("[aria-pressed='true']").get_attribute("data-mode") == "0"
+        assert not page.locator(".ramp").is_visible()
+        assert not any(page.locator(f"{rows}[hidden]").count() for rows in (".legend li", ".classes tbody tr"))
+    with opened_page(chromium) as page:
+        page.add_init_script("HTMLCanvasElement.prototype.getContext = () => null")
+        page.goto((tmp_path / "saved.html").as_uri())
+        assert page.locator(".poster").is_visible() and not page.locator(".controls").is_visible()
 
 
 def test_a_preview_that_the_browser_loses_leaves_its_picture(opened: Page) -> None:
