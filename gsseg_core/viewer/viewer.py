@@ -84,12 +84,14 @@ class Viewer:
         state, asked = self.state, self.panel.answer.ask()
         with self.panel.answer.telling(event.client):
             self.panel.clicked[event.client] = _place(event)
+            with state.lock:  # What it is known by may change meanwhile, and is kept.
+                shown = state.model.shown()
             picked = pick(
                 state.model.scene,
                 camera_of(event.client),
                 np.array(event.ray_origin),
                 np.array(event.ray_direction),
-                state.model.shown(),
+                shown,
                 device=state.device,
             )
             self.panel.answer.show_picked(asked, picked)

@@ -274,6 +274,27 @@ def test_meshes_are_of_what_was_sure_when_saving_began_though_a_live_source_is_l
     assert (viewed.model.confidence == 0).all() and (given[0] == np.float32(0.9)).all()
 
 
+def test_what_a_click_looks_through_is_known_anew_though_a_live_source_was_less_sure_meanwhile(
+    viewer: Viewer, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    viewed, confidence = viewer.state, Labelling.confidence
+    viewed.model.tree, viewed.model.min_confidence = None, 0.5
+    less_sure = LEARNT._replace(shares=LEARNT.shares.with_data(LEARNT.shares.data / 2))
+    at_once = meanwhile(viewed, lambda: viewed.replace(less_sure))
+
+    def known(labelling: Labelling) -> np.ndarray:
+        found = confidence(labelling)
+        at_once()
+        return found
+
+    viewed.model.relabel(LEARNT)
+    monkeypatch.setattr(Labelling, "confidence", known)
+    seen = MagicMock(fov=1.0, aspect=1.0, image_height=48, position=CAMERA.center, wxyz=np.eye(4)[0])
+    viewer._on_click(MagicMock(client=MagicMock(camera=seen), ray_origin=np.zeros(3), ray_direction=np.eye(3)[2]))
+    at_once()
+    assert viewed.objects is less_sure and not viewed.model.shown().any()
+
+
 def test_a_search_waits_for_the_list_that_is_being_rebuilt(viewer: Viewer, monkeypatch: pytest.MonkeyPatch) -> None:
     panel, add = viewer.panel, viewer.panel._add_row
     rows = [row._replace(name=f"new {row.name}") for row in viewer.state.seen()[1]]
