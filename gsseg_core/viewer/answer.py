@@ -7,7 +7,8 @@ through `paragraph` or `_isolated`, and into labels, which are text, only throug
 from __future__ import annotations
 
 import unicodedata
-from collections.abc import Callable, Iterator, Sequence
+from collections import Counter
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 
 import numpy as np
@@ -111,7 +112,8 @@ class Answer:
         least = min(_LEAST, max(probabilities.max(), 1e-9))
         ranked = np.argsort(-probabilities, kind="stable")[:MOST_CLASSES].tolist()
         best = [k for k in ranked if probabilities[k] >= least]
-        likely = ", ".join(f"{_isolated(model.name(k))} {probabilities[k]:.2f}" for k in best)
+        known = _told_apart({k: model.name(k) for k in best}, model.ids())
+        likely = ", ".join(f"{known[k]} {probabilities[k]:.2f}" for k in best)
         lines = [
             f", class {model.ids()[label]}" if label >= 0 else "",
             f"Gaussian {i}, {100 * picked.weight:.0f} % of the pixel",
@@ -120,10 +122,8 @@ class Answer:
         if votes is not None:
             views = counted(len({vote.view for vote in votes}), "view")
             lines.append(f"{views} voted for it" + (", the largest votes:" if votes else ""))
-            lines += [
-                f"{_isolated(v.view)}: {_isolated(class_name(classes, v.label))}, {v.weight:.1f} px"
-                for v in votes[:MOST_VIEWS]
-            ]
+            known = _told_apart({v.label: class_name(classes, v.label) for v in votes[:MOST_VIEWS]}, model.class_ids)
+            lines += [f"{_isolated(v.view)}: {known[v.label]}, {v.weight:.1f} px" for v in votes[:MOST_VIEWS]]
         return _of_html(*lines, title=shown_name(model.name(label)))
 
 
@@ -146,6 +146,15 @@ def paragraph(*lines: str, title: str = "") -> str:
 def _isolated(name: str) -> str:
     """HTML of a name, which leaves in its place what stands beside it though it is read from the right."""
     return f"<bdi>{html_text(shown_name(name))}</bdi>"
+
+
+def _told_apart(names: Mapping[int, str], ids: Sequence[int]) -> dict[int, str]:
+    """HTML of names of classes by number; the ids of the classes stand behind those that occur again."""
+    often = Counter(map(shown_name, names.values()))
+    return {
+        k: _isolated(name) + (f" ({ids[k] if k < len(ids) else k})" if often[shown_name(name)] > 1 else "")
+        for k, name in names.items()
+    }
 
 
 def _of_html(*lines: str, title: str) -> str:

@@ -300,8 +300,9 @@ class Panel:
 
     def _target_names(self) -> tuple[str, ...]:
         """Names by class id, as they are shown."""
-        known = {**self._state.added_names, **self._state.objects.class_names}
-        return _distinct([shown_name(class_name(known, k)) for k in range(max(known) + 1)])
+        known, ids = {**self._state.added_names, **self._state.objects.class_names}, self._state.model.class_ids
+        every = range(max(known) + 1)
+        return _distinct([shown_name(class_name(known, k)) for k in every], [*ids, *every[len(ids) :]])
 
     def _view_text(self, view: View) -> str:
         trust = self._state.reliability.get(view.name, math.nan)
@@ -328,10 +329,10 @@ def _chosen(dropdown: viser.GuiDropdownHandle[str], options: Sequence[str]) -> i
     return options.index(dropdown.value)
 
 
-def _distinct(texts: Sequence[str]) -> tuple[str, ...]:
-    """Append its number to a text that occurs a second time: texts are the only key that a dropdown has."""
+def _distinct(texts: Sequence[str], numbers: Sequence[int] = ()) -> tuple[str, ...]:
+    """Append its number, by default its place, to a text that occurs again: a dropdown has no other key than texts."""
     found: dict[str, None] = {}
-    for k, text in enumerate(texts):
+    for k, text in zip(numbers or range(len(texts)), texts, strict=False):
         while text in found:
             text = f"{text} ({k})"
         found[text] = None

@@ -165,3 +165,17 @@ def test_an_error_is_told_until_somebody_does_what_works(viewer: Viewer) -> None
     assert "Click on something" in answer._answer.content
     viewer._on_click(click_at(client, IN_BALL))
     assert f"<strong>{NAMES[1]}</strong>" in answer._answer.content
+
+
+def test_classes_of_one_name_are_told_apart_by_their_ids_wherever_both_are_named() -> None:
+    names = {**NAMES, 2: "ball", 3: "ball"}
+    shares = np.eye(len(NAMES), dtype=np.float32)[TRUTH] * np.float32(0.5)
+    shares[IN_BALL] = 0.1, 0.2, 0.4, 0.3
+    model = ViewModel(SCENE, labelled(TRUTH.astype(np.int32), shares, names), class_ids=(0, 4, 7, 9))
+    with closing(Viewer(model, listener=listen(port=PORT), draw=SERVER)) as viewer:
+        panel, asked = viewer.panel, viewer.panel.answer.ask()
+        assert panel._target.options == ("background", "red ball", "ball", "ball (9)")
+        panel.answer.show_picked(asked, Picked(IN_BALL, 0.5), [ViewVote("v", k, 1.0) for k in (3, 1, 2)])
+        told = panel.answer._answer.content
+    assert "<bdi>ball</bdi> (7) 0.40, <bdi>ball</bdi> (9) 0.30, <bdi>red ball</bdi> 0.20" in told
+    assert all(f"<bdi>{name}, 1.0 px" in told for name in ("ball</bdi> (9)", "red ball</bdi>", "ball</bdi> (7)"))
