@@ -344,7 +344,8 @@ class Segmentation:
         WriteError
             The file cannot be written; an earlier one is unchanged.
         """
-        header = {"format": FORMAT, "scene": self.scene_digest, "class_names": self.class_names,
+        known = {int(k): name for k, name in self.class_names.items()}  # Ids may be NumPy's, as `class_ids` are.
+        header = {"format": FORMAT, "scene": self.scene_digest, "class_names": known,
                   "temperature": self.temperature, **({} if run is None else {"run": run})}  # fmt: skip
         names, k = ("labels", "class_ids", "confidence", "clustered"), len(self.class_names)
         arrays: dict[str, Any] = {name: getattr(self, name) for name in names}

@@ -41,6 +41,13 @@ def test_a_result_calibrated_by_a_number_of_numpy_is_saved_and_loaded(tmp_path: 
     assert Segmentation.load(tmp_path / "it.npz", SCENE).temperature == 0.5
 
 
+def test_names_given_anew_by_the_class_ids_of_a_result_are_saved_and_loaded(tmp_path: Path) -> None:
+    result = Segmentation.from_codes(SCENE, CODES, NAMES)
+    renamed = replace(result, class_names={k: f"thing {k}" for k in result.class_ids})  # keys are NumPy's
+    renamed.save(tmp_path / "it.npz")
+    assert Segmentation.load(tmp_path / "it.npz", SCENE).class_names == {k: f"thing {k}" for k in NAMES}
+
+
 @pytest.mark.parametrize("name", ["two\nlines", "\x1b[31mred", "\ud800", " ", "x" * 201, 7, None])
 def test_a_name_of_a_class_that_is_not_one_line_of_text_is_refused(name: str) -> None:
     for use in (
