@@ -7,6 +7,7 @@ element by element, which takes seconds for a large cloud.
 from __future__ import annotations
 
 import array
+import difflib
 import math
 from collections.abc import Collection
 from typing import Any
@@ -244,6 +245,19 @@ def parameter_descriptor(
         else:
             descriptor.floating_point_range = [FloatingPointRange(from_value=float(low), to_value=float(high))]
     return descriptor
+
+
+def passed_over(node: Any) -> str:
+    """Say which parameters a node was given that it does not have, which ROS passes over; empty if none.
+
+    It is no error: those of a file's `/**` may be of another node.
+    """
+    # rclpy has no public word for either; quality of service is declared with each topic.
+    known = node._parameters.keys()
+    strange = sorted(name for name in node._parameter_overrides.keys() - known if not name.startswith("qos_overrides."))
+    near = [difflib.get_close_matches(name, known, 1) for name in strange]
+    said = [name + "".join(f" (did you mean {one}?)" for one in ones) for name, ones in zip(strange, near, strict=True)]
+    return f"parameters that this node does not have are passed over: {', '.join(said)}" if said else ""
 
 
 def camera_info(camera: Camera, header: Header) -> CameraInfo:

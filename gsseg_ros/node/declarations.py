@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import difflib
 from dataclasses import dataclass
 from typing import Any
 
@@ -221,16 +220,3 @@ def declare(node: Node) -> None:
     unset = [name for name in lists if node.get_parameter_or(name).value is None]
     # Who asks for all parameters, as `ros2 param dump` does, is told none if one of them has no value.
     node.set_parameters([Parameter(name, Parameter.Type.STRING_ARRAY, []) for name in unset])
-
-
-def passed_over(node: Node) -> str:
-    """Say which parameters a node was given that it does not have, which ROS passes over; empty if none.
-
-    It is no error: those of a file's `/**` may be of another node.
-    """
-    # rclpy has no public word for what was given; quality of service is declared with each topic.
-    given = (name for name in node._parameter_overrides if not name.startswith("qos_overrides."))
-    names, known = sorted(name for name in given if not node.has_parameter(name)), [d.name for d in DECLARATIONS]
-    near = (difflib.get_close_matches(name, known, 1) for name in names)
-    said = [name + "".join(f" (did you mean {one}?)" for one in ones) for name, ones in zip(names, near, strict=True)]
-    return f"parameters that this node does not have are passed over: {', '.join(said)}" if said else ""

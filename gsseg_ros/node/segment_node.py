@@ -24,6 +24,7 @@ from rclpy.signals import SignalHandlerOptions
 from gsseg_core.freed_memory import keep_freed_memory, search_no_imports_at_the_end
 from gsseg_core.live.living_session import LivingSession
 from gsseg_core.warm_up import warm_up
+from gsseg_ros.conversions import passed_over
 from gsseg_ros.node import declarations, diagnostics, parameters
 from gsseg_ros.node.complaints import Complaints
 from gsseg_ros.node.inputs import Inputs
@@ -77,8 +78,8 @@ class SegmentNode(LifecycleNode):
                 service.callback = self._answered(service.callback)
         self.configuring = False
         declarations.declare(self)
-        if passed_over := declarations.passed_over(self):
-            self.get_logger().warning(passed_over)
+        if strange := passed_over(self):
+            self.get_logger().warning(strange)
         self.workspace = Workspace(Settings.read(self), lambda: self.get_clock().now().to_msg())
         self.inputs: Inputs | None = None
         self.obstacles: Obstacles | None = None
