@@ -152,6 +152,10 @@ def test_a_phone_shows_all_of_it_without_scrolling_sideways(
             int(x) for x in page.evaluate("getComputedStyle(document.body).backgroundColor").strip("rgb()").split(",")
         ]
         assert (sum(paper) < 150) == (scheme == "dark")
+        figure = page.locator(".chart text").first.bounding_box()
+        assert figure is not None and figure["height"] > 10, (
+            "the chart is drawn smaller than elsewhere, its figures are not"
+        )
         assert shot(page.locator(CANVAS)).std() > 5
 
 
