@@ -258,8 +258,10 @@ def render(
         raise NoUsableViewsError(f"{data}: split {split!r} has no views; expected {expected}")
     bits = 8 if max(ids) < 255 else 16  # 255 means unknown in masks of 8 bits
     names, overlays = [view_file_name(view.name) for view in views], []
-    overview = ("contact_sheet.png", "legend.png")
-    pictures = {name: f"overlays/{'overlay_' * (name in overview)}{name}" for name in names}
+    overview, prefix = ("contact_sheet.png", "legend.png"), "overlay_"
+    while any(f"{prefix}{name}" in names for name in names if name in overview):
+        prefix += "overlay_"
+    pictures = {name: f"overlays/{prefix * (name in overview)}{name}" for name in names}
     places = [*names, *pictures.values(), *(f"overlays/{k}" for k in overview)]
     with staged_run(out, "render", places=places, inputs=folders_of(data)) as run:
         drawn, save = draw_views(scene, numbered, views, device=device), partial(save_png, run=run.id)

@@ -134,8 +134,9 @@ def test_scores_are_the_same_from_within_the_folder_of_the_truth(
 
 def test_a_view_called_like_the_legend_keeps_its_overlay(place: Path) -> None:
     cameras = place / "data/cameras.json"
-    cameras.write_text(cameras.read_text().replace("view2", "legend"))
-    (place / "data/labels/view2.png").rename(place / "data/labels/legend.png")
+    for view, name in (("view2", "legend"), ("view3", "overlay_legend")):
+        cameras.write_text(cameras.read_text().replace(view, name))
+        (place / f"data/labels/{view}.png").rename(place / f"data/labels/{name}.png")
     (place / "data/split.json").unlink()
     render = ["render", f"{place}/data/scene.ply", "--data", f"{place}/data", "--out", f"{place}/maps", "--quiet"]
     assert main([*render, "--segmentation", f"{place}/out/segmentation.npz", "--split", "all"]) == 0
