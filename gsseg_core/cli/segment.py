@@ -109,7 +109,7 @@ def run(options: argparse.Namespace) -> int:
 
 def _note_doubts(options: argparse.Namespace, report: dict[str, Any]) -> None:
     """Warn of what makes a whole run worthless."""
-    from gsseg_core.report.findings import NO_OBJECTS, grey_ids_of, has_objects, renamed_ids_of
+    from gsseg_core.report.findings import NO_OBJECTS, grey_ids_of, has_objects, renamed_ids_of, rounding_of
 
     known = [view["reliability"] for view in report["views"].get("reliability", ()) if view["reliability"] is not None]
     if known and median(known) < _HALF and report["settings"]["ids"] == "global":
@@ -123,5 +123,7 @@ def _note_doubts(options: argparse.Namespace, report: dict[str, Any]) -> None:
             f"the scene {looks} as the {agreement['compared']} do from these cameras: the two may be in different "
             f"frames; try --align, or gsseg doctor {options.data} --scene {options.scene}"
         )
+    if rounding := rounding_of(report):
+        note(rounding)
     if not has_objects(report):
         note(f"no Gaussian is part of an object: {NO_OBJECTS}")

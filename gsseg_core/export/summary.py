@@ -89,7 +89,7 @@ class RunSettings:
 class RunReport:
     """What a run found, from what, with which settings, and how long it took; its fields are those of `report.json`."""
 
-    scene: Mapping[str, Any]  # path, size and digest of what was segmented
+    scene: Mapping[str, Any]  # path, size, digest and `rounding` of what was segmented
     views: Mapping[str, Any]  # how many were used, and why others were not
     settings: Mapping[str, Any]  # all that determined the result
     objective: Sequence[float] = ()  # the learner's objective after each step
@@ -122,7 +122,12 @@ class RunReport:
         `digest` is that of the scene's file, where Gaussians have another order there.
         """
         return cls(
-            scene={"path": str(scene.path), "gaussians": len(scene), "digest": digest or scene.digest},
+            scene={
+                "path": str(scene.path),
+                "gaussians": len(scene),
+                "digest": digest or scene.digest,
+                "rounding": scene.rounding,
+            },
             gaussians=gaussian_counts(result),
             classes=class_table(scene, result, files, meshes),
             versions={"python": platform.python_version(), **{name: version(name) for name in PACKAGES}},

@@ -241,6 +241,12 @@ class GaussianScene:
             digest.update(np.ascontiguousarray(geometry, "<f4").data)
         return digest.hexdigest()
 
+    @cached_property
+    def rounding(self) -> float:
+        """By how much float32 moves centres at most, in standard deviations of their Gaussians: the median of all."""
+        steps = np.spacing(np.abs(self.means).max(axis=1))
+        return float(np.median(steps / 2 / self.scales.max(axis=1)))
+
     def colors(
         self, camera_center: npt.ArrayLike | None = None, ids: npt.NDArray[np.integer] | None = None
     ) -> npt.NDArray[np.float32]:  # (3,), (M,)

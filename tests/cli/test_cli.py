@@ -227,6 +227,23 @@ def test_masks_of_which_ids_are_shades_of_grey_are_said_to_be(place: Path, capsy
     assert "are these shades of grey" in (place / "out/report.html").read_text()
 
 
+def test_a_scene_too_far_from_its_origin_for_float32_is_said_to_be(
+    place: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    data, east = place / "data", 5e6
+    scene = GaussianScene.load(data / "scene.ply")
+    vertices = scene.vertices.copy()
+    vertices["x"] += east
+    GaussianScene.from_vertices(vertices, None).save(data / "scene.ply")
+    cameras = json.loads((data / "cameras.json").read_text())
+    for camera in cameras:
+        camera["position"][0] += east
+    (data / "cameras.json").write_text(json.dumps(cameras))
+    assert main(segment(place)) == 0
+    said = "he scene is so far from its origin that float32 moves Gaussians by up to"
+    assert f"t{said}" in capsys.readouterr().err and f"T{said}" in (place / "out/report.html").read_text()
+
+
 @pytest.mark.parametrize("line", ["view s", "segment s --data d --out o", "render s --data d --out o --segmentation f"])
 def test_every_command_that_renders_takes_the_number_of_a_gpu(line: str) -> None:
     assert build_parser().parse_args([*line.split(), "--device", "cuda:1"]).device == "cuda:1"
