@@ -45,13 +45,14 @@ def read_vertices(path: str | os.PathLike[str], within: Path | None = None) -> n
 
 
 def read_elements(path: Path, within: Path | None = None) -> dict[str, npt.NDArray[np.void]]:
-    """Read all elements of a PLY by name, as `read_vertices` reads one; properties that are lists are objects."""
+    """Read all elements of a PLY that have properties, by name, as `read_vertices` does; lists are objects."""
     with open_scene(path, within, "a PLY file") as file:
         try:
             ply = _read_header(file)
             # Text is wrapped here, since plyfile would leave its own wrapper open.
             with io.TextIOWrapper(file, "ascii") if ply.text else file as stream:
-                return {element.name: _read_rows(element, stream, ply) for element in ply}
+                # gsplat's compressed PLY of SH degree 0 has an element without properties.
+                return {element.name: _read_rows(element, stream, ply) for element in ply if element.properties}
         except plyfile.PlyParseError as error:
             raise ValueError(str(error)) from error
 
@@ -92,7 +93,7 @@ def _read_header(file: BinaryIO) -> Any:
     file.seek(header.tell())
     left = os.fstat(file.fileno()).st_size - header.tell()
     for element in ply:
-        if element.count and not element.properties:  # However many there are, they take no bytes.
+        if ply.text and element.count and not element.properties:  # An empty line each, perhaps, or none.
             raise ValueError(f"element {quoted(element.name)} of {element.count:,} rows has no properties")
         if ply.text:
             least = 2 * len(element.properties) * element.count - 1  # a digit and what follows it

@@ -150,9 +150,12 @@ def test_a_count_beyond_the_file_is_refused_before_memory_is_taken(tmp_path: Pat
 
 
 @pytest.mark.parametrize("encoding", ENCODINGS)
-def test_rows_without_properties_are_refused_and_not_counted_one_by_one(tmp_path: Path, encoding: str) -> None:
+def test_rows_without_properties_are_not_counted_one_by_one_and_refused_in_text(tmp_path: Path, encoding: str) -> None:
     path = write_ply(tmp_path / "a.ply", some_vertices(), encoding)
     path.write_bytes(path.read_bytes().replace(b"element", b"element empty 1000000000000\nelement", 1))
+    if encoding != "ascii":
+        np.testing.assert_array_equal(read_vertices(path), some_vertices())
+        return
     with pytest.raises(SceneFileError, match="element 'empty' of 1,000,000,000,000 rows has no properties"):
         read_vertices(path)
 

@@ -328,6 +328,16 @@ def test_of_a_ply_of_sh_degree_4_those_up_to_degree_3_are_read(tmp_path: Path) -
     assert read_scene(tmp_path / "a.ply").remarks == ("SH above degree 3 are left out",)
 
 
+def test_a_compressed_ply_of_gsplat_without_harmonics_names_them_all_the_same(tmp_path: Path) -> None:
+    path = tmp_path / "a.compressed.ply"
+    scene_files.write_compressed_ply(path, some_scene(degree=0))
+    written, plain = path.read_bytes(), GaussianScene.load(path)
+    path.write_bytes(written.replace(b"end_header\n", b"element sh 300\nend_header\n", 1))  # and no property
+    found = GaussianScene.load(path)
+    assert found.sh_degree == 0
+    np.testing.assert_array_equal(found.vertices, plain.vertices)
+
+
 def test_packed_vertices_are_laid_out_as_trainers_do() -> None:
     zeros = np.zeros((2, 3))
     rest = np.arange(18.0).reshape(2, 3, 3)
