@@ -24,7 +24,7 @@ from gsseg_core.scene.camera import Camera
 from gsseg_core.text import clipped, composed, quoted
 
 DETECTIONS = (".png", ".tif", ".tiff")
-_ORIENTATION = 0x0112  # tag of TIFF and EXIF
+_ORIENTATION, _PHOTOMETRIC = 0x0112, 0x0106  # tags of TIFF, the first of EXIF, too
 CLASS_ID = r"0|[1-9][0-9]{0,4}"
 _UNKNOWN = "unknown"
 _ANY = "*"
@@ -171,10 +171,17 @@ def _read_detections(folder: Path, camera: Camera | None, within: Path | None) -
 
 def _read_image(path: Path, camera: Camera | None, within: Path | None) -> npt.NDArray[np.float32]:
     """Read an image of one class, as probabilities (H, W) float32."""
-    with open_image(path, MaskFormatError, "image", "probabilities of one class", ("PNG", "TIFF"), within) as image:
-        turned = getattr(image, "tag_v2", {}).get(_ORIENTATION, 1)
+    expected = "probabilities of one class in 8 or 16 bits, or float32"
+    with open_image(path, MaskFormatError, "image", expected, ("PNG", "TIFF"), within) as image:
+        tags = getattr(image, "tag_v2", {})
+        turned = tags.get(_ORIENTATION, 1)
         if turned != 1:  # Pillow turns a TIFF as this says, and no other file; photos count as they are stored.
             raise MaskFormatError(f"{path}: has the orientation {turned} in its tags; expected 1, or none")
+        if tags.get(_PHOTOMETRIC) == 0:  # tifffile writes booleans so, and Pillow reads the opposite of them.
+            raise MaskFormatError(
+                f"{path}: is a TIFF in which 0 is white, as some write booleans; expected 0 to be black, as in 8 "
+                "bits of 0 and 255"
+            )
         if camera is not None:
             camera.check_mask_size(*image.size, str(path), drawn_on_image=True)
         mode, values = image.mode, np.array(image)

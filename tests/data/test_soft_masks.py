@@ -265,6 +265,28 @@ def test_a_detection_that_its_tags_turn_is_refused(tmp_path: Path) -> None:
         dataset_with(tmp_path, write).read_seen()
 
 
+@pytest.mark.parametrize("kind", ["1", "L"])
+def test_a_detection_in_which_0_is_white_is_refused_for_one_reader_has_it_inverted(tmp_path: Path, kind: str) -> None:
+    def write(labels: Path) -> None:
+        (labels / "view0").mkdir()
+        Image.new(kind, (WIDTH, HEIGHT), 1).save(labels / "view0/3.tif", tiffinfo={0x0106: 0})
+
+    with pytest.raises(MaskFormatError, match=r"3\.tif: is a TIFF in which 0 is white.*expected 0 to be black"):
+        dataset_with(tmp_path, write).read_seen()
+
+
+def test_a_detection_in_doubles_is_refused_with_what_is_read(tmp_path: Path) -> None:
+    def write(labels: Path) -> None:
+        (labels / "view0").mkdir()
+        path = labels / "view0/3.tif"
+        Image.fromarray(np.ones((HEIGHT, WIDTH), np.float32)).save(path)
+        bits = b"\x02\x01\x03\x00\x01\x00\x00\x00"  # the tag of the bits of a number
+        path.write_bytes(path.read_bytes().replace(bits + b"\x20", bits + b"\x40", 1))
+
+    with pytest.raises(MaskFormatError, match=r"3\.tif: broken image .*expected .* in 8 or 16 bits, or float32"):
+        dataset_with(tmp_path, write).read_seen()
+
+
 def test_supervises_json_tells_what_label_images_say_something_of(tmp_path: Path) -> None:
     write_dataset(tmp_path)
     for camera in ring(6):
