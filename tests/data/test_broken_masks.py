@@ -127,6 +127,7 @@ def runs_of(counts: object, size: object = (HEIGHT, WIDTH)) -> dict[str, object]
         (coco(images=[]), "has masks of no view"),
         (coco(categories=None), "is null; expected a list"),
         (coco(annotations=[{}]), "annotation 0: lacks 'image_id' (has nothing)"),
+        (coco(annotations=[{"image_id": 1, "segments_info": []}]), "is of COCO's panoptic form"),
     ],
 )  # fmt: skip
 def test_coco_that_is_wrong_is_refused(tmp_path: Path, whole: dict[str, object], said: str) -> None:

@@ -31,6 +31,11 @@ def read_coco(place: Place) -> MaskSet:
     shapes: defaultdict[object, list[Shape]] = defaultdict(list)
     images = _images(whole, place, path)
     annotations = list(whole.records("annotations", "annotation"))
+    if annotations and "segments_info" in annotations[0].fields:
+        raise MaskFormatError(
+            f"{path}: is of COCO's panoptic form, whose masks are images in colours; expected polygons or RLE: export "
+            "it as instances"
+        )
     _check_meet(whole, annotations)
     for annotation in annotations:
         image_id = annotation.value("image_id")
