@@ -82,21 +82,26 @@ def mask_hint(root: Path, labels: str, stems: Collection[str]) -> str:
     if classes:
         wrong = f"{labels}/ has a folder for each class, such as {classes[0].name}/"
         return f"{looked}, but {wrong}: make one for each view, {labels}/{stem}/<class id>.png ({_MORE})"
-    others = [path for path in (*_folders(root), *_annotations(root)) if path != root / labels]
-    below_it = [_DEPTH - len(path.relative_to(root).parts) for path in others]
+    below = (root / labels).resolve()
+    tops = [root] if below.is_relative_to(root.resolve()) else [root, root / labels]
+    others = {
+        path: _DEPTH - len(path.relative_to(top).parts) for top in tops for path in (*_folders(top), *_annotations(top))
+    }
+    for place in (root / labels, *_subfolders(root / labels)):  # of several files, one perhaps for test views
+        others |= dict.fromkeys(_annotations(place), 0)
+    others.pop(root / labels, None)
     counts = [
         (len(_masks(mask_files, path, stems)) or _count_foreign(path, stems, depth), path)
-        for path, depth in zip(others, below_it, strict=True)
+        for path, depth in others.items()
     ]
     # A folder that was named may be one too high; what lies beside it is perhaps something else, as true masks are.
-    below = (root / labels).resolve()
     count, place = max(
         counts, key=lambda found: (found[0] > 0 and below in found[1].resolve().parents, found[0]), default=(0, root)
     )
     if count:
         if (more := len(_masks(masks_below, place.parent, stems))) > count and place.parent != root:
             count, place = more, place.parent
-        name = os.path.relpath(place, root)
+        name = str(place) if tops[1:] and place.is_relative_to(tops[1]) else os.path.relpath(place, root)
         where = name + "/" * place.is_dir()
         return f"{looked}, found {count} masks of these names in {where}: type --labels {shlex.quote(name)}"
     if (root / labels).is_symlink() and not (root / labels).exists():

@@ -68,6 +68,21 @@ def test_annotations_of_another_program_are_found(data: Path, capsys: pytest.Cap
     assert folder == (place or "annotations.json")
 
 
+@pytest.mark.parametrize("beside", [False, True])
+def test_an_export_as_coco_that_is_named_by_its_folder_is_answered_with_its_file(
+    data: Path, capsys: pytest.CaptureFixture[str], beside: bool
+) -> None:
+    labels = {path.stem: np.array(Image.open(path)) for path in (data / "labels").iterdir()}
+    export = data.parent / "export" if beside else data / "export"
+    (export / "annotations").mkdir(parents=True)
+    mask_writers.coco(export / "annotations", labels, {0: "background", 1: "mug", 2: "cup", 3: "box"})
+    annotations = export / "annotations/annotations.json"
+    (annotations.parent / "test.json").write_text('{"images": [], "annotations": [], "categories": []}')
+    for named in (export, annotations.parent):
+        (file,) = typed(error_of(capsys, data, "--labels", str(named)), "--labels")
+        assert (data / file).resolve() == annotations.resolve()
+
+
 def test_masks_in_several_folders_are_found_together(data: Path, capsys: pytest.CaptureFixture[str]) -> None:
     for i, path in enumerate(sorted((data / "labels").iterdir())):
         (data / f"masks/{i % 2}").mkdir(parents=True, exist_ok=True)
