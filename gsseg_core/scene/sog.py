@@ -77,6 +77,11 @@ def _beside(meta: Path, name: str, most: int, within: Path | None) -> bytes:
 def _decode(meta: Any, load: Load) -> ReadScene:
     if not isinstance(meta, dict):
         raise UnfitError(f"{_META} holds {kind_of(meta)}; expected an object")
+    if "lodLevels" in meta:
+        raise UnfitError(
+            f"lists SOG scenes in {quoted(meta['lodLevels'])} levels of detail; expected one of them, such as "
+            "0_0/meta.json, or the scene that they were made of"
+        )
     version = whole_number(meta.get("version", 1), "version", 1, 2)
     count = meta["count"] if version == 2 else meta["means"]["shape"][0]
     check_count(whole_number(count, "count", 0, 2**63))

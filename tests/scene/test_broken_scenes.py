@@ -184,6 +184,7 @@ def test_sog_that_inflates_is_refused_before_it_does(tmp_path: Path) -> None:
         (b'"shape": [100', b'"shape": ["a"', "count is 'a'; expected a whole number"),
         (b'"quats"', b'"quat"', "truncated or not a SOG scene .lacks 'quats'"),
         (b"{", b"[{", "not valid JSON"),
+        (b"{", b'{"lodLevels": 2, ', "lists SOG scenes in 2 levels of detail; expected one of them"),
     ],
 )
 def test_sog_whose_words_do_not_fit_is_refused(tmp_path: Path, before: bytes, after: bytes, match: str) -> None:
