@@ -2,7 +2,7 @@
 
 A test is found to be one where its code, or that of a fixture or helper that it uses, names a module that starts
 processes. What the code under test starts by itself cannot be seen like this: such a test bears the marker itself, and
-one that does not fails in `make check` when its process starts.
+one that does not fails when its process starts.
 """
 
 from __future__ import annotations
@@ -47,7 +47,8 @@ def starts(function: Any) -> bool:
     while waiting:
         thing = waiting.pop()
         thing = getattr(thing, "__func__", thing)
-        thing = getattr(thing, "__wrapped__", thing)
+        if hasattr(thing, "__wrapped__"):
+            waiting.append(thing.__wrapped__)
         module = thing.__name__ if isinstance(thing, ModuleType) else getattr(thing, "__module__", None) or ""
         if module in STARTERS or module.split(".")[0] in STARTERS:
             return True
@@ -56,10 +57,7 @@ def starts(function: Any) -> bool:
             if isinstance(thing, type) and _is_of_tests(vars(sys.modules[module])):
                 methods += vars(thing).items()
             elif isinstance(thing, FunctionType) and _is_of_tests(thing.__globals__):
-                names = set(_names(thing.__code__))
-                if "fork" in names:
-                    return True
-                named |= names
+                named |= (names := set(_names(thing.__code__)))
                 waiting += [thing.__globals__[name] for name in names if name in thing.__globals__]
         if not waiting:  # Of a class, the methods that somebody names.
             waiting = [method for name, method in methods if name in named or name.startswith("__")]
