@@ -60,6 +60,7 @@ class Outcome:
     converged: bool  # whether it stopped because another step would have changed little
     loss: float  # what the learner minimises, per labelled pixel, in nats, at the end; NaN where there is no such thing
     rejected: dict[str, str]  # names of views that could not be used, and why
+    views: Sequence[View]  # that were to be learnt from, posed in the scene
 
 
 def observe_and_fit(
@@ -79,4 +80,4 @@ def observe_and_fit(
         temperature = calibrate(learner, checker, progress).temperature
         renamed = renamed_among_samples(checker) if named and learner.checks_masks else {}
     learnt = Learnt(name, learner.code_rows_, len(learner.views), temperature, learner.evidence(), renamed)
-    return Outcome(learnt, len(learner.history_), learner.converged_, learner.loss, dict(learner.rejected))
+    return Outcome(learnt, len(learner.history_), learner.converged_, learner.loss, dict(learner.rejected), views)

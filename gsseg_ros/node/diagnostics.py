@@ -225,8 +225,8 @@ def _verdict(
         return DiagnosticStatus.WARN, next(iter(complaints.values()))
     if others := namesakes(inputs):
         return DiagnosticStatus.WARN, others
-    if renamed := renamed_ids_of(session):
-        return DiagnosticStatus.WARN, renamed
+    if doubt := workspace.frames.problem(session) or renamed_ids_of(session):
+        return DiagnosticStatus.WARN, doubt
     return DiagnosticStatus.OK, "fusing"
 
 

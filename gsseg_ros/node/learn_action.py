@@ -91,7 +91,7 @@ class LearnAction:
         elif request.labels or request.label_map:
             raise InvalidRequestError("labels and label_map are those of a dataset; expected dataset_path beside them")
         self._workspace.placement.finish(job.check)  # What is learnt of views stays as it is where they move.
-        version, known = session.version, renamed_ids_of(session)
+        version, known, scene = session.version, renamed_ids_of(session), session.scene
         try:
             outcome = session.learn(
                 learner,
@@ -105,8 +105,11 @@ class LearnAction:
             if session.version != version:
                 self._services.show()
             raise
-        if (note := renamed_ids_of(session)) and not known:
-            self._services.node.get_logger().warning(note)
+        with run.watch.stage("compare"):
+            wrong_frames = self._workspace.frames.look(session, scene, outcome)
+        for note in (wrong_frames, "" if known else renamed_ids_of(session)):
+            if note:
+                self._services.node.get_logger().warning(note)
         self._workspace.number(run)
         result.num_steps, result.converged, result.loss = outcome.num_steps, outcome.converged, outcome.loss
         result.report = self._report(session, outcome, run)

@@ -24,6 +24,7 @@ from gsseg_core.refine.settings import RefineSettings
 from gsseg_core.scene.gaussian_scene import GaussianScene
 from gsseg_ros.conversions import stamp_message, stamp_ns
 from gsseg_ros.errors import InvalidRequestError, MissingFileError, NoSceneError, NotActiveError
+from gsseg_ros.node.frame_check import FrameCheck
 from gsseg_ros.node.jobs import JobSlot, Requests
 from gsseg_ros.node.masks.label_space import LabelSpace, NewNames
 from gsseg_ros.node.parameters import Settings
@@ -57,6 +58,7 @@ class Workspace:
         self.settings, self.requests = settings, Requests()  # as of now; those at work
         self.slot = JobSlot()  # taken by whatever must not run beside a learn job
         self.placement = Placement(lambda: self._session)
+        self.frames = FrameCheck()
         self.forget_waiting: Callable[[], None] = lambda: None  # drops the masks that wait to be fused
         self.label_space = LabelSpace(settings.class_names, None, settings.max_classes)
         self._at_start = {name: getattr(settings, name) for name in _PATHS}

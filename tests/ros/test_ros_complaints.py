@@ -15,6 +15,7 @@ from rclpy.time import Time
 from gsseg_core.live import results as live_results
 from gsseg_ros.node import diagnostics
 from gsseg_ros.node.complaints import KINDS, REASONS, REFUSED_POSE, Complaints
+from gsseg_ros.node.frame_check import FrameCheck
 from gsseg_ros.node.pairing import Pairing
 from gsseg_ros.node.pose_sources import MessagePoses
 from gsseg_ros.node.sim_time import SimTime, on_set_back
@@ -165,13 +166,22 @@ class Hears:
     def verdict(self, clock_problem: str = "") -> tuple[bytes, str]:
         scene = type("Scene", (list,), {"path": "scene.ply"})()
         session = SimpleNamespace(
-            learnt=None, scene=scene, class_names={}, renamed=[], has_codes=False, num_fused=0, num_views=0, version=0
+            learnt=None,
+            scene=scene,
+            class_names={},
+            renamed=[],
+            has_codes=False,
+            num_fused=0,
+            num_views=0,
+            version=0,
+            era=0,
         )
         workspace: Any = SimpleNamespace(
             active=True,
             loaded=session,
             last_job="none",
             changes=Counter(),
+            frames=FrameCheck(),
             refused_change=self.refused_change,
         )
         (status,) = diagnostics.diagnostic_array("gsseg", workspace, self.inputs, Time().to_msg(), clock_problem).status

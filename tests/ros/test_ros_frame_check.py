@@ -1,0 +1,59 @@
+"""Poses of another frame than the scene's are told of once the node has learnt from their views."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from ros_helpers import Ros, ros_fixture  # noqa: F401
+from ros_robot import CLASSES, Robot
+from small_scenes import NAMES, balls_on_a_table, clean_views, fed, write_dataset
+
+from gsseg_core.data.view import View
+from gsseg_core.live.living_session import LivingSession
+from gsseg_ros.node.frame_check import FrameCheck
+
+
+def tilted(views: Sequence[View]) -> list[View]:
+    """Views with the poses of something else on the robot, which the camera looks down from by 30 degrees."""
+    turn = np.eye(4)
+    turn[1:3, 1:3] = [[np.sqrt(0.75), 0.5], [-0.5, np.sqrt(0.75)]]
+    cameras = [replace(view.camera, world_to_camera=turn @ view.camera.world_to_camera) for view in views]
+    return [replace(view, camera=camera) for view, camera in zip(views, cameras, strict=True)]
+
+
+@pytest.mark.parametrize("count", [1, 2, 5])
+def test_views_of_the_scenes_own_frame_are_not_complained_of(count: int) -> None:
+    session = fed(LivingSession(balls_on_a_table()[0], NAMES), clean_views(count))
+    assert FrameCheck().look(session, session.scene, session.learn()) == ""
+
+
+def test_what_was_found_holds_until_the_views_are_forgotten_or_others_are_learnt_from() -> None:
+    session, frames = LivingSession(balls_on_a_table()[0], NAMES), FrameCheck()
+    fed(session, tilted(clean_views()))
+    said = frames.look(session, session.scene, session.learn())
+    assert said.startswith("the scene does not look as the masks do from these cameras (agreement with 5 masks 0.")
+    assert "optical frame" in said and "scene_to_map" in said
+    assert frames.problem(session) == said
+    fed(session, clean_views())  # Under the same names: the others are gone.
+    assert frames.look(session, session.scene, session.learn()) == frames.problem(session) == ""
+    fed(session, tilted(clean_views()))
+    frames.look(session, session.scene, session.learn())
+    session.reset()
+    assert frames.problem(session) == ""
+
+
+def test_the_log_and_diagnostics_say_so(ros: Ros, tmp_path: Path) -> None:
+    write_dataset(tmp_path)
+    robot = Robot(ros)
+    node = robot.start({"scene_path": tmp_path / "scene.ply", "class_names": CLASSES})
+    robot.wait_active()
+    robot.fuse(tilted(clean_views()))
+    robot.learn()
+    robot.wait_for_status(lambda status: "optical frame" in status["message"], "the doubt")
+    assert "the scene does not look as the masks do from these cameras" in node.output
+    robot.done("reset")
+    robot.wait_for_status(lambda status: status["message"] == "fusing", "no doubt")
