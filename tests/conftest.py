@@ -48,8 +48,12 @@ def pytest_configure(config: pytest.Config) -> None:
         signal.signal(signal.SIGINT, signal.default_int_handler)
     sys.addaudithook(processes.refuse_events)
     gc.disable()  # Until all is imported, of which nothing is garbage: a fifth of that time.
-    if config.option.markexpr == f"not {processes.MARKER}":
+    if _starts_none(config):
         os.fsync = lambda file: None  # The machine goes on, and there are 5,000 of them.
+
+
+def _starts_none(config: pytest.Config) -> bool:
+    return bool(config.option.markexpr == f"not {processes.MARKER}")
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
@@ -70,8 +74,8 @@ def pytest_collection_finish() -> None:
 
 @pytest.hookimpl(wrapper=True)
 def pytest_runtest_protocol(item: pytest.Item) -> Iterator[None]:
-    """Hold a test that is not marked as one that starts processes to starting none, lest `make check` fail by it."""
-    processes.allow(item.get_closest_marker(processes.MARKER) is not None)
+    """Hold the tests that are left where those that start processes are left out to starting none."""
+    processes.allow(not _starts_none(item.config))
     try:
         return (yield)
     finally:

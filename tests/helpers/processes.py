@@ -2,7 +2,7 @@
 
 A test is found to be one where its code, or that of a fixture or helper that it uses, names a module that starts
 processes. What the code under test starts by itself cannot be seen like this: such a test bears the marker itself, and
-one that does not fails when its process starts.
+one that does not fails in `make check` when its process starts.
 """
 
 from __future__ import annotations
