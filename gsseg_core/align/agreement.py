@@ -87,6 +87,14 @@ class Agreement:
     chance: float  # of pictures that do not belong together
     agrees: bool | None  # whether cameras and scene belong together; None where that is undecided
 
+    @property
+    def doubt(self) -> str:
+        """Say in a sentence without its stop that cameras and scene may not belong together; "" where they do."""
+        if self.agrees:
+            return ""
+        looks = "hardly looks" if self.agrees is None else "does not look"
+        return f"the scene {looks} as the {self.compared} do from these cameras"
+
     def __str__(self) -> str:
         """Describe it for people."""
         return f"agreement with {self.views} {self.compared} {self.score:.2f}, by chance {self.chance:.2f}"

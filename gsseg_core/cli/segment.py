@@ -109,6 +109,7 @@ def run(options: argparse.Namespace) -> int:
 
 def _note_doubts(options: argparse.Namespace, report: dict[str, Any]) -> None:
     """Warn of what makes a whole run worthless."""
+    from gsseg_core.align.agreement import Agreement
     from gsseg_core.report.findings import NO_OBJECTS, grey_ids_of, has_objects, renamed_ids_of, rounding_of
 
     known = [view["reliability"] for view in report["views"].get("reliability", ()) if view["reliability"] is not None]
@@ -117,11 +118,10 @@ def _note_doubts(options: argparse.Namespace, report: dict[str, Any]) -> None:
     elif of_ids := grey_ids_of(report) or renamed_ids_of(report):
         note(of_ids)
     agreement = report["frame"]["agreement"]
-    if agreement and not agreement["agrees"]:  # None where it is undecided.
-        looks = "does not look" if agreement["agrees"] is False else "hardly looks"
+    if agreement and (doubt := Agreement(**agreement).doubt):
         note(
-            f"the scene {looks} as the {agreement['compared']} do from these cameras: the two may be in different "
-            f"frames; try --align, or gsseg doctor {options.data} --scene {options.scene}"
+            f"{doubt}: the two may be in different frames; try --align, or gsseg doctor {options.data} --scene "
+            f"{options.scene}"
         )
     if rounding := rounding_of(report):
         note(rounding)

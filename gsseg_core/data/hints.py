@@ -83,16 +83,10 @@ def mask_hint(root: Path, labels: str, stems: Collection[str]) -> str:
         wrong = f"{labels}/ has a folder for each class, such as {classes[0].name}/"
         return f"{looked}, but {wrong}: make one for each view, {labels}/{stem}/<class id>.png ({_MORE})"
     below = (root / labels).resolve()
-    tops = [root] if below.is_relative_to(root.resolve()) else [root, root / labels]
-    others = {
-        path: _DEPTH - len(path.relative_to(top).parts) for top in tops for path in (*_folders(top), *_annotations(top))
-    }
-    for place in (root / labels, *_subfolders(root / labels)):  # of several files, one perhaps for test views
-        others |= dict.fromkeys(_annotations(place), 0)
-    others.pop(root / labels, None)
+    outside = not below.is_relative_to(root.resolve())
     counts = [
         (len(_masks(mask_files, path, stems)) or _count_foreign(path, stems, depth), path)
-        for path, depth in others.items()
+        for path, depth in _places_of_masks(root, labels, outside=outside).items()
     ]
     # A folder that was named may be one too high; what lies beside it is perhaps something else, as true masks are.
     count, place = max(
@@ -101,7 +95,7 @@ def mask_hint(root: Path, labels: str, stems: Collection[str]) -> str:
     if count:
         if (more := len(_masks(masks_below, place.parent, stems))) > count and place.parent != root:
             count, place = more, place.parent
-        name = str(place) if tops[1:] and place.is_relative_to(tops[1]) else os.path.relpath(place, root)
+        name = str(place) if outside and place.is_relative_to(root / labels) else os.path.relpath(place, root)
         where = name + "/" * place.is_dir()
         return f"{looked}, found {count} masks of these names in {where}: type --labels {shlex.quote(name)}"
     if (root / labels).is_symlink() and not (root / labels).exists():
@@ -125,6 +119,18 @@ def mask_hint(root: Path, labels: str, stems: Collection[str]) -> str:
     if sum(path.stem.startswith((f"{stem}_", f"{stem}-")) for path in found) > 1:
         return f"{wrong}, several of a view: make a folder for each view, {labels}/{stem}/<class id>.png ({_MORE})"
     return f"{wrong}: rename them to the names of the images"
+
+
+def _places_of_masks(root: Path, labels: str, *, outside: bool) -> dict[Path, int]:
+    """List folders and files in which masks may be, but for `labels` itself, and how far below each to look."""
+    tops = [root, root / labels] if outside else [root]
+    places = {
+        path: _DEPTH - len(path.relative_to(top).parts) for top in tops for path in (*_folders(top), *_annotations(top))
+    }
+    for folder in (root / labels, *_subfolders(root / labels)):  # of several files, one perhaps for test views
+        places |= dict.fromkeys(_annotations(folder), 0)
+    places.pop(root / labels, None)
+    return places
 
 
 def _has_cameras(folder: Path) -> bool:

@@ -23,9 +23,9 @@ class FrameCheck:
         said = ""
         if found is not None and found.agrees is False:
             said = (
-                f"the scene does not look as the {found.compared} do from these cameras ({found}): the two seem to be "
-                "in different frames; expected poses of the camera's optical frame (x right, y down, z forward) in "
-                "map_frame, and scene_to_map to say where the scene lies there"
+                f"{found.doubt} ({found}): the two seem to be in different frames; expected poses of the camera's "
+                "optical frame (x right, y down, z forward) in map_frame, and scene_to_map to say where the scene lies "
+                "there"
             )
         self._found = session.era, said
         return said
