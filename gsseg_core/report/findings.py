@@ -150,16 +150,19 @@ def warnings_of(
         if told:
             warnings.append(f"{told[:1].upper()}{told[1:]}.")
     names = dict(enumerate(entry["name"] for entry in report["classes"]))
-    empty = [names.pop(k) for k, entry in enumerate(report["classes"]) if entry["id"] and not entry["gaussians"]]
+    empty = {k: names[k] for k, entry in enumerate(report["classes"]) if entry["id"] and not entry["gaussians"]}
     if empty and report.get("ids"):
         warnings.append(
             f"{len(empty):,} of {counted(report['ids']['objects'], 'object')} that were found got no Gaussian, as "
-            f"other views give what their masks show to others: {listed(empty, NOTED, written)}."
+            f"other views give what their masks show to others: {listed(empty.values(), NOTED, written)}."
         )
     elif empty:
-        warnings.append(f"{counted(len(empty), 'class', 'classes')} got no Gaussian: {listed(empty, NOTED, written)}.")
+        warnings.append(
+            f"{counted(len(empty), 'class', 'classes')} got no Gaussian: {listed(empty.values(), NOTED, written)}."
+        )
     if ious is not None:
-        weak = [names[k] for k in np.argsort(ious).tolist() if k in names and ious[k] < KNOWN_CLASS]
+        told_of = names.keys() - empty.keys()
+        weak = [names[k] for k in np.argsort(ious).tolist() if k in told_of and ious[k] < KNOWN_CLASS]
         if weak:
             warnings.append(
                 f"Of {counted(len(weak), 'class', 'classes')} masks and prediction overlap by less than half "
