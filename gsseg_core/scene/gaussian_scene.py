@@ -6,7 +6,7 @@ import hashlib
 import os
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field, replace
-from functools import cached_property
+from functools import cached_property, reduce
 from pathlib import Path
 from typing import Any
 
@@ -244,8 +244,9 @@ class GaussianScene:
     @cached_property
     def rounding(self) -> float:
         """By how much float32 moves centres at most, in standard deviations of their Gaussians: the median of all."""
-        steps = np.spacing(np.abs(self.means).max(axis=1))
-        return float(np.median(steps / 2 / self.scales.max(axis=1)))
+        # Column by column: the same along axis 1 takes four times as long.
+        far, large = (reduce(np.maximum, np.abs(rows).T) for rows in (self.means, self.scales))
+        return float(np.median(np.spacing(far) / 2 / large))
 
     def colors(
         self, camera_center: npt.ArrayLike | None = None, ids: npt.NDArray[np.integer] | None = None
