@@ -10,8 +10,7 @@ import hashlib
 import os
 import struct
 import zlib
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable
 from functools import cached_property
 from io import BufferedReader
 from pathlib import Path
@@ -24,7 +23,7 @@ from PIL.PngImagePlugin import PngInfo
 
 from gsseg_core.errors import MaskFormatError, SettingsError
 from gsseg_core.files.atomic import write_atomically
-from gsseg_core.files.input_files import check_pixels, decode_image, open_input, reason
+from gsseg_core.files.input_files import check_pixels, decode_image, open_expected
 
 UNKNOWN = -1
 
@@ -77,7 +76,8 @@ def read_mask(
     broken, or another kind of image (RGB, alpha, 1-bit, not a PNG), and what `check_size` raises of its width and
     height, before any pixel is read.
     """
-    with _open_mask(path, within) as file:
+    # Once for header and pixels: in between, another file may take its name.
+    with open_expected(path, MaskFormatError, "a label image", within) as file:
         header = _read_header(file, str(path))
         check_size(header.width, header.height)
         # Other formats are lossy or ambiguous about integers, whatever the file is named.
@@ -89,18 +89,8 @@ def read_mask(
 
 def mask_header(path: str | os.PathLike[str], within: Path | None = None) -> PngHeader:
     """Read the header of a label image; raises as `read_mask` does."""
-    with _open_mask(path, within) as file:
+    with open_expected(path, MaskFormatError, "a label image", within) as file:
         return _read_header(file, str(path))
-
-
-@contextmanager
-def _open_mask(path: str | os.PathLike[str], within: Path | None) -> Iterator[BufferedReader]:
-    """Open a label image, once for header and pixels: in between, another file may take its name."""
-    try:
-        with open_input(path, within) as file:
-            yield file
-    except OSError as error:
-        raise MaskFormatError(f"{path}: cannot be read ({reason(error)}); expected a label image") from error
 
 
 def _read_header(file: BufferedReader, source: str) -> PngHeader:

@@ -78,6 +78,19 @@ def open_input(path: str | os.PathLike[str], within: Path | None = None) -> Buff
     return os.fdopen(number, "rb")
 
 
+@contextmanager
+def open_expected(
+    path: str | os.PathLike[str], error: type[GssegError], expected: str = "", within: Path | None = None
+) -> Iterator[BufferedReader]:
+    """Open a file by `open_input`; raise `error`, which says what was `expected`, if it cannot be opened or read."""
+    try:
+        with open_input(path, within) as file:
+            yield file
+    except OSError as cause:
+        wanted = f"; expected {expected}" if expected else ""
+        raise error(f"{path}: cannot be read ({reason(cause)}){wanted}") from cause
+
+
 def read_input(
     path: str | os.PathLike[str], error: type[GssegError], within: Path | None = None, first: int | None = None
 ) -> bytes:
@@ -86,11 +99,8 @@ def read_input(
     Raises `error` if it cannot be read, or is larger than any JSON file is, as `Limits.max_json_bytes` says.
     """
     limit = LIMITS.max_json_bytes
-    try:
-        with open_input(path, within) as file:
-            content = file.read(limit + 1 if first is None else first)
-    except OSError as cause:
-        raise error(f"{path}: cannot be read ({reason(cause)})") from cause
+    with open_expected(path, error, within=within) as file:
+        content = file.read(limit + 1 if first is None else first)
     if len(content) > limit:
         raise error(f"{path}: is too large; expected at most {limit:,} bytes (limit max_json_bytes)")
     return content
@@ -189,11 +199,10 @@ def open_image(
     what was `expected`. `formats` are names of Pillow's, all by default. With `within`, the image must lie below that
     folder, links followed.
     """
-    try:
-        file = open_input(path, within)
-    except OSError as cause:
-        raise error(f"{path}: cannot be read ({reason(cause)}); expected {expected}") from cause
-    with file, decode_image(file, str(path), error, kind, expected, formats) as image:
+    with (
+        open_expected(path, error, expected, within) as file,
+        decode_image(file, str(path), error, kind, expected, formats) as image,
+    ):
         yield image
 
 

@@ -7,10 +7,10 @@ from pathlib import Path
 import numpy as np
 import numpy.typing as npt
 
-from gsseg_core.errors import SceneFileError
-from gsseg_core.files.input_files import DAMAGED, reason
+from gsseg_core.files.input_files import UnfitError
 from gsseg_core.scene.ply import read_elements
 from gsseg_core.scene.quaternions import from_smallest_three
+from gsseg_core.scene.scene_file import refusing_damage
 from gsseg_core.scene.vertices import REST_COUNTS, ReadScene, dc_of, logits, pack_in_blocks, pack_vertices, rest_names
 
 _BLOCK = 256
@@ -27,25 +27,21 @@ def is_compressed_ply(head: bytes) -> bool:
 def read_compressed_ply(path: Path, within: Path | None = None) -> ReadScene:
     """Read a compressed PLY, with or without extremes of colours and with or without SH."""
     elements = read_elements(path, within)
-    chunks, vertices = elements.get("chunk"), elements.get("vertex")
-    if chunks is None or vertices is None or not set(_PACKED).issubset(vertices.dtype.names or ()):
-        raise SceneFileError(f"{path}: lacks elements or properties of a compressed PLY; expected {', '.join(_PACKED)}")
-    n = len(vertices)
-    if len(chunks) != -(-n // _BLOCK):
-        raise SceneFileError(f"{path}: has {len(chunks):,} chunks for {n:,} vertices; expected {-(-n // _BLOCK):,}")
-    sh = elements.get("sh")
-    if sh is not None and len(sh) != n:
-        raise SceneFileError(f"{path}: has SH of {len(sh):,} Gaussians for {n:,} vertices; expected as many")
+    chunks, vertices, sh = (elements.get(name) for name in ("chunk", "vertex", "sh"))
+    with refusing_damage(path, "a compressed PLY"):
+        if chunks is None or vertices is None or not set(_PACKED).issubset(vertices.dtype.names or ()):
+            raise UnfitError(f"lacks elements or properties of a compressed PLY; expected {', '.join(_PACKED)}")
+        n = len(vertices)
+        if len(chunks) != -(-n // _BLOCK):
+            raise UnfitError(f"has {len(chunks):,} chunks for {n:,} vertices; expected {-(-n // _BLOCK):,}")
+        if sh is not None and len(sh) != n:
+            raise UnfitError(f"has SH of {len(sh):,} Gaussians for {n:,} vertices; expected as many")
 
-    def pack(block: slice) -> npt.NDArray[np.void]:
-        of_block = chunks[block.start // _BLOCK : block.stop // _BLOCK]
-        return _pack(of_block, vertices[block], None if sh is None else sh[block])
+        def pack(block: slice) -> npt.NDArray[np.void]:
+            of_block = chunks[block.start // _BLOCK : block.stop // _BLOCK]
+            return _pack(of_block, vertices[block], None if sh is None else sh[block])
 
-    try:
-        packed = pack_in_blocks(n, pack)
-    except DAMAGED as error:
-        raise SceneFileError(f"{path}: not a compressed PLY ({reason(error)}); expected one of PlayCanvas") from error
-    return ReadScene(packed)
+        return ReadScene(pack_in_blocks(n, pack))
 
 
 def _pack(

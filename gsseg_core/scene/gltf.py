@@ -15,7 +15,7 @@ import numpy as np
 import numpy.typing as npt
 
 from gsseg_core.errors import SceneFileError
-from gsseg_core.files.input_files import UnfitError, open_input, reason
+from gsseg_core.files.input_files import UnfitError, open_expected
 from gsseg_core.files.limits import LIMITS
 from gsseg_core.scene.camera import rigid_motion
 from gsseg_core.scene.moving import move
@@ -187,12 +187,9 @@ class _Reader:
         name = unquote(uri)
         if Path(name).name != name or "\\" in name:
             raise UnfitError(f"names the buffer {quoted(name)}; expected the name of a file beside it")
-        try:
-            with open_input(self._path.parent / name, self._within) as file:
-                check_size(size_of(file), size, name)
-                return file.read()
-        except OSError as error:
-            raise SceneFileError(f"{self._path.parent / name}: cannot be read ({reason(error)})") from error
+        with open_expected(self._path.parent / name, SceneFileError, within=self._within) as file:
+            check_size(size_of(file), size, name)
+            return file.read()
 
 
 def _matrix(node: Any) -> npt.NDArray[np.float64]:

@@ -9,7 +9,7 @@ from io import BufferedReader
 from pathlib import Path
 
 from gsseg_core.errors import SceneFileError
-from gsseg_core.files.input_files import DAMAGED, UnfitError, open_input, reason
+from gsseg_core.files.input_files import DAMAGED, UnfitError, open_expected, reason
 from gsseg_core.files.limits import LIMITS
 from gsseg_core.text import clipped
 
@@ -22,13 +22,15 @@ def open_scene(path: Path, within: Path | None, expected: str) -> Iterator[Buffe
     `UnfitError`, whose message says what was found and expected; `PathNotAllowedError` where it does not lie below
     `within`, links followed.
     """
+    with open_expected(path, SceneFileError, expected, within) as file, refusing_damage(path, expected):
+        yield file
+
+
+@contextmanager
+def refusing_damage(path: Path, expected: str) -> Iterator[None]:
+    """Raise `SceneFileError` in place of what the body raises of the content of a file, as `open_scene` does."""
     try:
-        file = open_input(path, within)
-    except OSError as error:
-        raise SceneFileError(f"{path}: cannot be read ({reason(error)}); expected {expected}") from error
-    try:
-        with file:
-            yield file
+        yield
     except UnfitError as error:
         raise SceneFileError(f"{path}: {error}") from error
     except MemoryError as error:

@@ -15,7 +15,7 @@ import numpy.typing as npt
 from PIL import Image
 
 from gsseg_core.errors import SceneFileError
-from gsseg_core.files.input_files import UnfitError, check_pixels, open_input, reason
+from gsseg_core.files.input_files import UnfitError, check_pixels, open_expected
 from gsseg_core.files.json_files import kind_of, read_json, whole_number
 from gsseg_core.files.limits import LIMITS
 from gsseg_core.scene.quaternions import from_smallest_three
@@ -65,13 +65,10 @@ def _member(archive: zipfile.ZipFile, name: str, most: int) -> bytes:
 
 
 def _beside(meta: Path, name: str, most: int, within: Path | None) -> bytes:
-    try:
-        with open_input(meta.parent / name, within) as file:
-            if size_of(file) > most:
-                raise UnfitError(f"has {size_of(file):,} bytes of {quoted(name)}; expected at most {most:,}")
-            return file.read()
-    except OSError as error:
-        raise SceneFileError(f"{meta.parent / name}: cannot be read ({reason(error)}); {_META} names it") from error
+    with open_expected(meta.parent / name, SceneFileError, f"an image, as {_META} names it", within) as file:
+        if size_of(file) > most:
+            raise UnfitError(f"has {size_of(file):,} bytes of {quoted(name)}; expected at most {most:,}")
+        return file.read()
 
 
 def _decode(meta: Any, load: Load) -> ReadScene:

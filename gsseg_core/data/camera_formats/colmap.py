@@ -17,7 +17,7 @@ import numpy as np
 
 from gsseg_core.data.camera_formats.entries import Intrinsics, cameras_of, stem_of
 from gsseg_core.errors import CameraFileError, IntrinsicsError, PoseError, WriteError
-from gsseg_core.files.input_files import UnfitError, is_there, open_input, reason
+from gsseg_core.files.input_files import UnfitError, is_there, open_expected, reason
 from gsseg_core.scene.camera import Camera
 from gsseg_core.scene.lens import MODELS_BY_NAME
 from gsseg_core.text import clipped, quoted
@@ -86,10 +86,8 @@ def _load(path: Path, within: Path | None) -> pycolmap.Reconstruction:
         for file, copy in zip((cameras, images), copies, strict=True):
             copied = BytesIO()
             try:
-                with open_input(file, within) as source:
+                with open_expected(file, CameraFileError, within=within) as source:
                     copy(source, copied)
-            except OSError as error:
-                raise CameraFileError(f"{file}: cannot be read ({reason(error)})") from error
             except UnfitError as error:
                 raise CameraFileError(f"{file}: {error}") from error
             except (struct.error, ValueError) as error:
