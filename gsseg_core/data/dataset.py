@@ -113,7 +113,7 @@ class Dataset:
 
     def _take_masks(self, masks: MaskSet) -> None:
         """Take the masks of another program, with its names of classes if it has any; blank ones are none."""
-        names = self._declared if masks.class_names is None else dict(sorted(masks.class_names.items()))
+        names = self._declared if masks.class_names is None else dict(masks.class_names)
         self._declared = None if masks.per_view else names
         drawn = {image: mask for image, mask in masks.views.items() if not mask.blank}
         self._change_views(lambda view: {"foreign_mask": drawn.get(view.camera.image)})

@@ -5,9 +5,8 @@ from __future__ import annotations
 from collections import defaultdict
 from pathlib import Path
 
-from gsseg_core.data.class_names import BACKGROUND_NAME
 from gsseg_core.data.mask_formats.masks import MaskSet, ViewMask, ids_from_zero
-from gsseg_core.data.mask_formats.place import Place
+from gsseg_core.data.mask_formats.place import Place, view_of
 from gsseg_core.data.mask_formats.record import Record
 from gsseg_core.data.mask_formats.rle import run_lengths
 from gsseg_core.data.mask_formats.shapes import Drawing, Polygons, Region, Runs, Shape
@@ -52,7 +51,7 @@ def read_coco(place: Place) -> MaskSet:
     views = {
         view: ViewMask.of(Drawing(*size, shapes[image_id]), where) for image_id, (view, where, size) in images.items()
     }
-    return MaskSet(views, {**{labels[i]: name for i, name in sorted(names.items())}, 0: BACKGROUND_NAME})
+    return MaskSet(views, {labels[i]: name for i, name in names.items() if labels[i]})
 
 
 def segmentation(annotation: Record, width: int, height: int) -> Region:
@@ -87,21 +86,18 @@ def _check_meet(whole: Record, annotations: list[Record]) -> None:
 def _images(whole: Record, place: Place, path: Path) -> dict[object, tuple[str, str, tuple[int, int]]]:
     """View, place for messages, and size of each image that is a view, by the id of the image."""
     found: dict[object, tuple[str, str, tuple[int, int]]] = {}
-    taken: dict[str, str] = {}
-    for image in whole.records("images", "image"):
-        name = image.text("file_name")
-        extra = image.fields.get("extra")
-        given = extra.get("name") if isinstance(extra, dict) else None  # Roboflow's: the name before it renamed it.
-        view = place.view_of(name) or (place.view_of(given) if isinstance(given, str) else None)
-        if view is None:
-            continue
-        if view in taken:
-            raise MaskFormatError(
-                f"{path}: has images {quoted(taken[view])} and {quoted(name)} for view '{view}'; expected one for each"
-            )
+    named = ((_name(image, place), image) for image in whole.records("images", "image"))
+    for view, image in place.views(named, path).items():
         image_id = image.value("id")
         if not isinstance(image_id, (int, str)) or image_id in found:
             raise MaskFormatError(f"{image.where}: has the id {quoted(image_id)}; expected another one for each image")
-        taken[view] = name
-        found[image_id] = (view, f"{path}, image {quoted(name)}", image.size("width", "height"))
+        where = f"{path}, image {quoted(image.text('file_name'))}"
+        found[image_id] = (view, where, image.size("width", "height"))
     return found
+
+
+def _name(image: Record, place: Place) -> str:
+    """Name by which an image may be of a view: that of its file, or the one that it had before Roboflow renamed it."""
+    name, extra = image.text("file_name"), image.fields.get("extra")
+    given = extra.get("name") if isinstance(extra, dict) else None
+    return given if isinstance(given, str) and view_of(name, place.stems) is None else name

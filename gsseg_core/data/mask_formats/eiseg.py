@@ -14,7 +14,6 @@ from pathlib import Path
 import numpy as np
 import numpy.typing as npt
 
-from gsseg_core.data.class_names import BACKGROUND_NAME
 from gsseg_core.data.label_images import mask_header
 from gsseg_core.data.mask_formats.images import read_label_image
 from gsseg_core.data.mask_formats.masks import MaskSet, ViewMask, check_id, check_name
@@ -50,7 +49,7 @@ def read_eiseg(place: Place) -> MaskSet:
         header = mask_header(path, place.within)
         read = partial(read_label_image, path, within=place.within)
         views[view] = ViewMask(str(path), read, (header.width, header.height))
-    return MaskSet(views, {0: BACKGROUND_NAME, **dict(sorted(names.items()))} if names else None)
+    return MaskSet(views, names or None)
 
 
 def _listed(place: Place) -> dict[int, str]:

@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 import numpy.typing as npt
 
 from gsseg_core.data.label_images import read_mask
-from gsseg_core.data.mask_formats.shapes import check_fit, scaled
+from gsseg_core.data.mask_formats.shapes import Drawing, Part, Shape, check_fit, scaled
 from gsseg_core.errors import MaskFormatError
 from gsseg_core.files.input_files import open_image
 from gsseg_core.scene.camera import Camera
@@ -27,15 +28,22 @@ def read_label_image(path: Path, camera: Camera, within: Path | None = None) -> 
     return scaled(mask.labels, camera)
 
 
-def paint_objects(masks: Iterable[tuple[int, Path]], camera: Camera, within: Path | None) -> npt.NDArray[np.int32]:
-    """Paint labels (H, W) where PNGs of one channel are not 0, each on top of those before it, 0 elsewhere.
+@dataclass(frozen=True, eq=False)
+class _Object:
+    """The region of one object in the image of a camera: where a PNG is not 0."""
 
-    Errors are those of `read_label_image`.
-    """
-    labels = np.zeros(camera.image_size[::-1], np.int32)
-    for label, path in masks:
-        labels[read_object(path, camera, within)] = label
-    return labels
+    path: Path
+    camera: Camera
+    within: Path | None
+
+    def parts(self, width: int, height: int) -> Iterator[Part]:
+        """See `Region`."""
+        yield Part(0, 0, read_object(self.path, self.camera, self.within))
+
+
+def drawing_of_objects(masks: Iterable[tuple[int, Path]], camera: Camera, within: Path | None) -> Drawing:
+    """Make a drawing of PNGs of one object each, with its label; when it is painted, they raise as `read_object`."""
+    return Drawing(*camera.image_size, [Shape(label, _Object(path, camera, within)) for label, path in masks])
 
 
 def read_object(path: Path, camera: Camera | None, within: Path | None) -> npt.NDArray[np.bool_]:

@@ -62,7 +62,7 @@ class MaskSet:
     """The masks of all views that another program wrote."""
 
     views: Mapping[str, ViewMask]
-    class_names: Mapping[int, str] | None = None  # by id; None where ids have no names
+    class_names: Mapping[int, str] | None = None  # by id; None where ids have no names; a reader may leave out 0
     per_view: bool = False  # whether an id means something in its own view only
     format: str = ""  # name in `MASK_FORMATS`
 
@@ -81,9 +81,8 @@ def number_names(names: Iterable[str], where: str) -> dict[str, int]:
 
 
 def names_of(numbers: Mapping[str, int]) -> dict[int, str]:
-    """Turn ids by name into names by id; the background has gsseg's name."""
-    found = {number: name for name, number in numbers.items() if number > 0}
-    return {0: BACKGROUND_NAME, **dict(sorted(found.items()))}
+    """Turn ids by name into names by id, those of objects alone."""
+    return {number: name for name, number in numbers.items() if number > 0}
 
 
 def ids_from_zero(names: Mapping[int, str]) -> dict[int, int]:

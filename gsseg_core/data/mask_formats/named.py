@@ -1,4 +1,4 @@
-"""Formats with a JSON file per image and shapes that name their class: what LabelMe and ISAT have in common.
+"""Formats with shapes that name their class, as a rule in a JSON file per image: what they have in common.
 
 Classes are numbered from 1 in alphabetical order. A file is read once for its names, and again when its view is asked
 for, so that no more than one is in memory.
@@ -6,7 +6,7 @@ for, so that no more than one is in memory.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Mapping
 from functools import partial
 from pathlib import Path
 from typing import NamedTuple
@@ -35,7 +35,12 @@ class NamedDrawing(NamedTuple):
     """Shapes of one image, and its width and height."""
 
     size: tuple[int, int]
-    shapes: Iterator[NamedShape]
+    shapes: Iterable[NamedShape]
+
+    def numbered(self, numbers: Mapping[str, int]) -> Drawing:
+        """Give the shapes the ids of their classes; the highest layer is on top, and of one layer the last shape."""
+        ordered = sorted(self.shapes, key=lambda shape: shape.layer)
+        return Drawing(*self.size, [Shape(numbers[name], region) for name, region, _ in ordered])
 
 
 Parser = Callable[[Record], NamedDrawing]
@@ -62,8 +67,10 @@ def _open(place: Place, path: Path) -> Record:
 
 
 def _read(place: Place, path: Path, parse: Parser, numbers: dict[str, int], camera: Camera) -> npt.NDArray[np.int32]:
-    size, named = parse(_open(place, path))
-    shapes = sorted(named, key=lambda shape: shape.layer)  # of one layer, in their order
-    if any(shape.name not in numbers for shape in shapes):
-        raise MaskFormatError(f"{path}: has other classes than when it was first read; expected a file that stays")
-    return Drawing(*size, [Shape(numbers[name], region) for name, region, _ in shapes]).labels(camera, str(path))
+    try:
+        drawing = parse(_open(place, path)).numbered(numbers)
+    except KeyError as cause:
+        raise MaskFormatError(
+            f"{path}: has other classes than when it was first read; expected a file that stays"
+        ) from cause
+    return drawing.labels(camera, str(path))

@@ -3,15 +3,18 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Collection, Iterable, Iterator
+from collections.abc import Collection, Iterable
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path, PureWindowsPath
+from typing import TypeVar
 
 from gsseg_core.errors import MaskFormatError
 from gsseg_core.files.input_files import IMAGE_SUFFIXES, list_below, list_folder, read_input
 from gsseg_core.files.json_files import read_json
-from gsseg_core.text import composed
+from gsseg_core.text import clipped, composed
+
+T = TypeVar("T")
 
 SUPERVISES = "supervises.json"
 """Which classes were looked for in gsseg's own label images; see `data/mask_files.py`."""
@@ -103,7 +106,7 @@ class Place:
         if len(self.stems) == 1 and files == [self.path]:
             return dict.fromkeys(self.stems, self.path)
         if self._has_masks:
-            return self.views((path.name, path) for path in files)
+            return self.views(((path.name, path) for path in files), self.path)
         return views_below(self.path, self.stems, (suffix,), self.within, self.depth)
 
     @cached_property
@@ -112,18 +115,19 @@ class Place:
         of_views = any(view_of(path.name, self.stems) for path in self.entries)
         return of_views or not self.entries or any(self.only(suffix) for suffix in (".json", ".xml"))
 
-    def views(self, named: Iterator[tuple[str, Path]]) -> dict[str, Path]:
-        """Find the views that names belong to; raises as `by_view` does."""
-        found: dict[str, Path] = {}
-        for name, path in named:
+    def views(self, named: Iterable[tuple[str, T]], where: Path) -> dict[str, T]:
+        """Find the views that names belong to, and what has these names; raises as `by_view` does, of `where` it is."""
+        found: dict[str, tuple[str, T]] = {}
+        for name, one in named:
             view = self.view_of(name)
-            if view is not None and view in found:
+            if view in found:
                 raise MaskFormatError(
-                    f"{self.path}: has {found[view].name} and {path.name} for view '{view}'; expected one mask per view"
+                    f"{where}: has {clipped(found[view][0])} and {clipped(name)} for view '{view}'; expected one mask "
+                    "per view"
                 )
             if view is not None:
-                found[view] = path
-        return found
+                found[view] = name, one
+        return {view: one for view, (_, one) in found.items()}
 
     @cached_property
     def sample(self) -> tuple[Path, object]:

@@ -8,7 +8,7 @@ was fell short of what the generator asks for. Else they are background.
 from __future__ import annotations
 
 import csv
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import dataclass
 from functools import cached_property, partial
@@ -16,12 +16,12 @@ from pathlib import Path
 
 import numpy as np
 
-from gsseg_core.data.mask_formats.images import read_object
+from gsseg_core.data.mask_formats.images import drawing_of_objects, read_object
 from gsseg_core.data.mask_formats.masks import MaskSet, ViewMask
 from gsseg_core.data.mask_formats.place import Place
 from gsseg_core.data.mask_formats.record import records
 from gsseg_core.data.mask_formats.rle import run_lengths
-from gsseg_core.data.mask_formats.shapes import Drawing, Nested, Part, Runs, Shape, paint_nested
+from gsseg_core.data.mask_formats.shapes import Drawing, Nested, Runs, Shape
 from gsseg_core.errors import GssegError, MaskFormatError
 from gsseg_core.files.input_files import check_pixels
 from gsseg_core.files.json_files import read_json
@@ -42,9 +42,7 @@ def is_sam_json(place: Place) -> bool:
 def read_sam_json(place: Place) -> MaskSet:
     """Read masks in JSON, a file per image: a list, or an object with the list `annotations`, as SA-1B has it."""
     files, size = place.by_view(".json"), _drawing(*place.sample)[:2]
-    covered = _Covered(tuple(files.values()), partial(_share_of_json, place))
-    reads = {view: partial(_read_json, place, covered, path) for view, path in files.items()}
-    return MaskSet({view: ViewMask(str(files[view]), read, size) for view, read in reads.items()}, per_view=True)
+    return _masks(files, partial(_read_json, place), partial(_share_of_json, place), size)
 
 
 def is_sam_folder(place: Place) -> bool:
@@ -54,10 +52,23 @@ def is_sam_folder(place: Place) -> bool:
 
 def read_sam_folder(place: Place) -> MaskSet:
     """Read masks in PNGs, with their areas from `metadata.csv`."""
-    folders = _folders(place)
-    covered = _Covered(tuple(folders.values()), partial(_share_of_folder, place))
-    reads = {view: partial(_read_folder, place, covered, path) for view, path in folders.items()}
-    return MaskSet({view: ViewMask(str(folders[view]), read) for view, read in reads.items()}, per_view=True)
+    return _masks(_folders(place), partial(_read_folder, place), partial(_share_of_folder, place))
+
+
+def _masks(
+    places: dict[str, Path],  # files or folders by view
+    read: Callable[[Path, Camera], Nested],
+    share_of: Callable[[Path], float],
+    size: tuple[int, int] | None = None,
+) -> MaskSet:
+    """Make masks of all views by how one is read, and by how much of its image has masks."""
+    covered = _Covered(tuple(places.values()), share_of)
+    reads = {view: partial(_nested, read, covered, path) for view, path in places.items()}
+    return MaskSet({view: ViewMask(str(places[view]), reads[view], size) for view in places}, per_view=True)
+
+
+def _nested(read: Callable[[Path, Camera], Nested], covered: _Covered, path: Path, camera: Camera) -> Nested:
+    return read(path, camera)._replace(of_everything=covered.most)
 
 
 @dataclass(frozen=True)
@@ -77,9 +88,8 @@ class _Covered:
         return bool(np.median(shares or [0.0]) > 0.5)
 
 
-def _read_json(place: Place, covered: _Covered, path: Path, camera: Camera) -> Nested:
-    drawing = _opened(place, path) or Drawing(*camera.image_size, [])
-    return drawing.nested(camera, str(path))._replace(of_everything=covered.most)
+def _read_json(place: Place, path: Path, camera: Camera) -> Nested:
+    return (_opened(place, path) or Drawing(*camera.image_size, [])).nested(camera, str(path))
 
 
 def _share_of_json(place: Place, path: Path) -> float:
@@ -127,25 +137,11 @@ def _drawing(path: Path, content: object) -> Drawing:
 def _folders(place: Place) -> dict[str, Path]:
     """Folders with metadata by view; the place itself, if it is the folder of one view."""
     folders = [path for path in (*place.folders, place.path) if (path / METADATA).is_file()]
-    return place.views((path.name, path) for path in folders)
+    return place.views(((path.name, path) for path in folders), place.path)
 
 
-@dataclass(frozen=True, eq=False)
-class _Image:
-    """What one PNG covers of a camera's image."""
-
-    path: Path
-    camera: Camera
-    within: Path | None
-
-    def parts(self, width: int, height: int) -> Iterator[Part]:
-        """See `Region`."""
-        yield Part(0, 0, read_object(self.path, self.camera, self.within))
-
-
-def _read_folder(place: Place, covered: _Covered, folder: Path, camera: Camera) -> Nested:
-    shapes = [Shape(label, _Image(path, camera, place.within)) for label, path in _listed_in(place, folder)]
-    return paint_nested(shapes, *camera.image_size)._replace(of_everything=covered.most)
+def _read_folder(place: Place, folder: Path, camera: Camera) -> Nested:
+    return drawing_of_objects(_listed_in(place, folder), camera, place.within).nested(camera, str(folder))
 
 
 def _share_of_folder(place: Place, folder: Path) -> float:

@@ -11,12 +11,16 @@ from collections import defaultdict
 from functools import partial
 from pathlib import Path
 
-from gsseg_core.data.mask_formats.images import paint_objects
+import numpy as np
+import numpy.typing as npt
+
+from gsseg_core.data.mask_formats.images import drawing_of_objects
 from gsseg_core.data.mask_formats.masks import MaskSet, ViewMask
 from gsseg_core.data.mask_formats.place import Place
 from gsseg_core.errors import MaskFormatError
 from gsseg_core.files.input_files import list_folder
 from gsseg_core.files.limits import MAX_LABEL
+from gsseg_core.scene.camera import Camera
 
 
 def is_sam2(place: Place) -> bool:
@@ -34,8 +38,12 @@ def read_sam2(place: Place) -> MaskSet:
     for number, files in sorted(objects.items(), reverse=True):
         for view, path in files.items():
             views[view][number + shift] = path
-    reads = {view: partial(paint_objects, list(files.items()), within=place.within) for view, files in views.items()}
-    return MaskSet({view: ViewMask(f"{place.path}, view '{view}'", read) for view, read in reads.items()})
+    wheres = {view: f"{place.path}, view '{view}'" for view in views}
+    return MaskSet({view: ViewMask(where, partial(_read, place, views[view], where)) for view, where in wheres.items()})
+
+
+def _read(place: Place, files: dict[int, Path], where: str, camera: Camera) -> npt.NDArray[np.int32]:
+    return drawing_of_objects(files.items(), camera, place.within).labels(camera, where)
 
 
 def _is_object(folder: Path) -> bool:
@@ -48,6 +56,6 @@ def _objects(place: Place) -> dict[int, dict[str, Path]]:
     found = {}
     for folder in place.folders:
         files = (path for path in list_folder(folder, MaskFormatError, place.within) if path.suffix.lower() == ".png")
-        if masks := place.views((path.name, path) for path in files):
+        if masks := place.views(((path.name, path) for path in files), folder):
             found[int(folder.name)] = masks
     return found

@@ -12,6 +12,7 @@ from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 
+from gsseg_core.data.class_names import BACKGROUND_NAME
 from gsseg_core.data.label_images import mask_header
 from gsseg_core.data.mask_files import CLASS_ID, DETECTIONS, mask_files, masks_below
 from gsseg_core.data.mask_formats.coco import is_coco, read_coco
@@ -143,7 +144,10 @@ def open_masks(
         raise MaskFormatError(
             f"{path}: has masks of no view{others}; expected names of views, such as {names_of_views}"
         )
-    return None if masks is None else replace(masks, format=found[0].name)
+    if masks is None or masks.class_names is None:
+        return masks and replace(masks, format=found[0].name)
+    names_by_id = {0: BACKGROUND_NAME, **masks.class_names}
+    return replace(masks, format=found[0].name, class_names=dict(sorted(names_by_id.items())))
 
 
 def known_formats() -> str:

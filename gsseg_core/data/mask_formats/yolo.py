@@ -16,7 +16,6 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from gsseg_core.data.class_names import BACKGROUND_NAME
 from gsseg_core.data.mask_formats.masks import MaskSet, ViewMask, check_id, check_name
 from gsseg_core.data.mask_formats.place import Place
 from gsseg_core.data.mask_formats.shapes import Drawing, Polygons, Shape
@@ -46,12 +45,12 @@ def read_yolo(place: Place) -> MaskSet:
     names = _names(place)
     views = {view: ViewMask(str(path), partial(_read, place, path, tracked)) for view, path in files.items()}
     if names is None:
-        names = {label - 1: f"class_{label - 1:02d}" for label in sorted(ids)}
+        names = {label - 1: f"class_{label - 1:02d}" for label in ids}
     elif lacking := sorted(ids - {c + 1 for c in names}):
         raise MaskFormatError(
             f"{place.path}: has the class {lacking[0] - 1}, which has no name in data.yaml or classes.txt"
         )
-    return MaskSet(views, {0: BACKGROUND_NAME, **{c + 1: name for c, name in sorted(names.items())}})
+    return MaskSet(views, {c + 1: name for c, name in names.items()})
 
 
 def _are_tracked(folder: Path, texts: Iterable[str]) -> bool:
