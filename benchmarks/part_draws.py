@@ -135,7 +135,7 @@ class Trial:
         for view in views:
             operator, labels = make_operator(scene, view.camera), view.read_labels()
             self.observations[view.name] = observation = operator.observe(labels)
-            self.lifted[view.name] = Lifted.of(observation).bordered(scene, operator, labels)
+            self.lifted[view.name] = Lifted.of(observation.by_label()).bordered(scene, operator, labels)
 
     def score(self, settings: AssociationSettings) -> tuple[float, int, float]:
         """IoU of the objects one to one, how many were found, and the level."""

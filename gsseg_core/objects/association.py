@@ -52,8 +52,8 @@ from gsseg_core.objects.association_kernels import dots_of_pairs
 from gsseg_core.objects.depth_edges import Borders
 from gsseg_core.objects.lifted_segments import Lifted
 from gsseg_core.objects.move_kernels import add_objects, by_view, explain_segments
-from gsseg_core.objects.sparse_products import product_above
-from gsseg_core.objects.stacked_segments import Stack, Voters, grouping
+from gsseg_core.objects.sparse_products import grouping, product_above
+from gsseg_core.objects.stacked_segments import Stack, Voters
 
 _BEST = 0.75  # pairs that agree nearly as well as the best one merge at once, before anything is compared anew
 _MOST = 0.6  # agreement above which clusters are one object whatever the segmenter does

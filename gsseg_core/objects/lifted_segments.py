@@ -12,7 +12,8 @@ from gsseg_core.metrics import iou
 from gsseg_core.objects.association_kernels import add_common
 from gsseg_core.objects.depth_edges import Borders, borders, depth_edges
 from gsseg_core.objects.heaviest import heaviest
-from gsseg_core.raster.observation import LabelWeights, Observation
+from gsseg_core.objects.sparse_products import grouping, sums
+from gsseg_core.raster.observation import LabelWeights
 from gsseg_core.raster.view_operator import ViewOperator
 from gsseg_core.scene.gaussian_scene import GaussianScene
 
@@ -28,13 +29,8 @@ class Lifted:
     wholes: np.ndarray | None = None  # (L,) int32: by segment, the id of the whole that it is a part of in its mask
 
     @classmethod
-    def of(cls, observation: Observation, kept: float = 0.8) -> Lifted:
+    def of(cls, seen: LabelWeights, kept: float = 0.8) -> Lifted:
         """Lift the ids of a mask; of each, only the heaviest Gaussians that make up a share of its weight."""
-        return cls.of_weights(observation.by_label(), kept)
-
-    @classmethod
-    def of_weights(cls, seen: LabelWeights, kept: float = 0.8) -> Lifted:
-        """Lift the ids of a mask, as `of` does, from their weights."""
         size, heavy = heaviest(seen.start, seen.weights, kept)
         ids, weights = seen.gaussians[heavy], seen.weights[heavy]
         start = starts(heavy)[seen.start]
@@ -58,9 +54,8 @@ class Lifted:
 
     def wholes_of_several(self) -> sparse.csr_matrix:
         """Tell which segments make up each whole of several, (W, L) float32 of ones."""
-        found, number = np.unique(self.ids if self.wholes is None else self.wholes, return_inverse=True)
-        rows = np.ones(len(self), np.float32), number, np.arange(len(self) + 1)
-        wholes = sparse.csr_matrix(rows, shape=(len(self), len(found))).T.tocsr()
+        _, number = np.unique(self.ids if self.wholes is None else self.wholes, return_inverse=True)
+        wholes = grouping(number)
         return wholes[np.diff(wholes.indptr) > 1]
 
     def __len__(self) -> int:
@@ -82,13 +77,12 @@ class Profiles:
     @classmethod
     def of(cls, votes: CSRRows, kept: float) -> Profiles:
         """Make those of votes for objects, in px; of each, only the heaviest Gaussians, as `Lifted.of` does."""
-        counts, voted = np.diff(votes.indptr), votes.data > 0
-        ids = np.repeat(np.arange(len(counts)), counts)[voted]
-        objects, weights = votes.indices[voted].astype(np.int64), votes.data[voted]
-        order = np.lexsort([ids, -weights, objects])
-        shape = len(counts), int(objects.max(initial=0)) + 1
-        heavy = order[_heaviest(objects[order], weights[order], np.bincount(objects, weights, shape[1]), kept)]
-        return cls(sparse.csr_matrix((weights[heavy], (ids[heavy], objects[heavy])), shape=shape))
+        shape = votes.num_rows, int(votes.indices.max(initial=0)) + 1
+        px = np.maximum(votes.data, 0).astype(np.float32)
+        weights = sparse.csr_matrix((px, votes.indices.astype(np.int64), votes.indptr), shape=shape).tocsc()
+        weights.data *= heaviest(weights.indptr.astype(np.int64), weights.data, kept)[1]
+        weights.eliminate_zeros()
+        return cls(weights.tocsr())
 
     def copy(self) -> Profiles:
         """Return another one like it, in no more memory."""
@@ -98,11 +92,11 @@ class Profiles:
 
     def add(self, segments: Lifted, objects: np.ndarray) -> None:  # (L,)
         """Add the segments of a view to their objects."""
-        part = _by_object(segments, objects, int(objects.max(initial=0)) + 1).tocoo()
-        at = segments.gaussians[part.row], part.col
+        part = (grouping(objects) @ segments.weights.astype(np.float64)).tocoo()
+        at = segments.gaussians[part.col], part.row
         if sum(more.nnz for more in self._more) > self._sum.nnz:  # Nobody may ask for the sum, view after view.
             self._add_up()
-        self._more.append(sparse.coo_matrix((part.data, at), shape=(len(self), part.shape[1])))
+        self._more.append(sparse.coo_matrix((part.data, at), shape=(len(self), part.shape[0])))
 
     def renumbered(self, objects: np.ndarray) -> Profiles:  # (K,)
         """Give the objects other numbers; those that get the same one become one."""
@@ -167,21 +161,3 @@ def without_gaps(numbers: np.ndarray) -> tuple[np.ndarray, np.ndarray]:  # (P,),
     present = np.flatnonzero(place).astype(np.int32)
     place[present] = np.arange(len(present), dtype=np.int32)
     return present, place[numbers]
-
-
-def _heaviest(segments: np.ndarray, weights: np.ndarray, size: np.ndarray, kept: float) -> np.ndarray:
-    """Find the weights that make up a share of the size of their segment, which come heaviest first, (P,) bool."""
-    before = np.repeat(np.cumsum(size) - size, np.bincount(segments, minlength=len(size)))
-    above = np.cumsum(weights, dtype=np.float64) - weights - before
-    return np.asarray((above < kept * size[segments]) & (weights > 0))
-
-
-def _by_object(segments: Lifted, objects: np.ndarray, num: int) -> sparse.csr_matrix:
-    """Sum the weights of segments by object, (M, num)."""
-    groups = sparse.csr_matrix((np.ones(len(objects)), objects, np.arange(len(objects) + 1)), shape=(len(objects), num))
-    return (segments.weights.T @ groups).tocsr()
-
-
-def sums(matrix: sparse.csr_matrix, axis: int) -> np.ndarray:
-    """Sum over an axis, float64."""
-    return np.asarray(matrix.sum(axis=axis, dtype=np.float64)).ravel()

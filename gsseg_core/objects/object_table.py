@@ -16,7 +16,8 @@ from gsseg_core.errors import SceneValueError, SettingsError, UnknownLabelError
 from gsseg_core.files.limits import MAX_LABEL
 from gsseg_core.learn.all_or_nothing import Undo, all_or_nothing, checkpoint
 from gsseg_core.objects.association import AssociationSettings, associate
-from gsseg_core.objects.lifted_segments import Lifted, Profiles, sums
+from gsseg_core.objects.lifted_segments import Lifted, Profiles
+from gsseg_core.objects.sparse_products import sums
 from gsseg_core.objects.tree_growing import grow_tree
 from gsseg_core.progress import Progress, silent
 from gsseg_core.raster.backends import make_operator
@@ -122,7 +123,7 @@ class ObjectTable:
         observation = operator.observe(labels)
         if not observation.num_pairs:
             return None
-        self._add(view, Lifted.of(observation, self.settings.kept).bordered(self.scene, operator, labels))
+        self._add(view, Lifted.of(observation.by_label(), self.settings.kept).bordered(self.scene, operator, labels))
         self._give(view.name, self._lifted[view.name].ids)
         return observation
 
@@ -278,7 +279,7 @@ class ObjectTable:
         seen = operator.lift(labels)
         if not len(seen.gaussians):
             return None
-        lifted = Lifted.of_weights(seen, self.settings.kept).bordered(self.scene, operator, labels)
+        lifted = Lifted.of(seen, self.settings.kept).bordered(self.scene, operator, labels)
         return lifted if outermost is None else replace(lifted, wholes=outermost[lifted.ids])
 
     def _open(

@@ -1,4 +1,4 @@
-"""Products of sparse matrices of which only large entries matter."""
+"""Sums over the rows of sparse matrices, and products of which only large entries matter."""
 
 from __future__ import annotations
 
@@ -8,6 +8,17 @@ from scipy import sparse
 from gsseg_core.objects.association_kernels import pack, rows_above
 
 _SCRATCH = 1 << 25  # entries of a product that there is room for at a time
+
+
+def grouping(number: np.ndarray) -> sparse.csr_matrix:  # (n,)
+    """Ones that add up the rows of each group, (groups, n) float32."""
+    shape = int(number.max(initial=-1)) + 1, len(number)
+    return sparse.csr_matrix((np.ones(len(number), np.float32), (number, np.arange(len(number)))), shape=shape)
+
+
+def sums(matrix: sparse.csr_matrix, axis: int) -> np.ndarray:
+    """Sum over an axis, float64."""
+    return np.asarray(matrix.sum(axis=axis, dtype=np.float64)).ravel()
 
 
 def product_above(

@@ -10,8 +10,8 @@ from scipy import sparse
 
 from gsseg_core.csr_rows import starts
 from gsseg_core.objects.depth_edges import Borders
-from gsseg_core.objects.lifted_segments import Lifted, sums, without_gaps
-from gsseg_core.objects.sparse_products import product_above
+from gsseg_core.objects.lifted_segments import Lifted, without_gaps
+from gsseg_core.objects.sparse_products import product_above, sums
 
 _BY_WHOLES = 1 / 3  # of a view's vote; with a half, wholes that all views agree on would join objects by themselves
 _LEAST = 0.01  # of what a view sees of a segment: what has no larger a share in common with it is taken for nothing
@@ -90,9 +90,3 @@ class Stack:
         """Stack what stands where the weights of each view do, (n, I)."""
         rows = [view.of_all(self.num_gaussians, entries) for view, entries in zip(self.views, data, strict=True)]
         return sparse.vstack(rows, format="csr")
-
-
-def grouping(number: np.ndarray) -> sparse.csr_matrix:  # (n,)
-    """Ones that add up the rows of each group, (groups, n) float32."""
-    shape = int(number.max(initial=-1)) + 1, len(number)
-    return sparse.csr_matrix((np.ones(len(number), np.float32), (number, np.arange(len(number)))), shape=shape)

@@ -80,7 +80,7 @@ def test_a_view_of_which_no_objects_are_known_has_none_or_is_refused() -> None:
 
 def test_what_is_found_does_not_depend_on_the_order_of_the_views() -> None:
     views = [shuffled(in_halves(view, 1 + i % 3)) for i, view in enumerate(VIEWS)]
-    lifted = {v.name: Lifted.of(make_operator(SCENE, v.camera).observe(v.read_labels())) for v in views}
+    lifted = {v.name: Lifted.of(make_operator(SCENE, v.camera).lift(v.read_labels())) for v in views}
     expected = associate(lifted).objects
     for order in (list(lifted)[::-1], list(np.random.default_rng(0).permutation(list(lifted)))):
         found = associate({str(name): lifted[str(name)] for name in order}).objects

@@ -51,7 +51,7 @@ def slow_lifted(seen: LabelWeights, kept: float) -> list[tuple[int, dict[int, fl
 def test_a_segment_is_its_heaviest_gaussians_to_the_last_bit_whatever_is_alike_empty_or_zero(
     seen: LabelWeights, kept: float
 ) -> None:
-    lifted, expected = Lifted.of_weights(seen, kept), slow_lifted(seen, kept)
+    lifted, expected = Lifted.of(seen, kept), slow_lifted(seen, kept)
     assert lifted.ids.tolist() == [label for label, _ in expected]
     assert lifted.gaussians.tolist() == sorted({g for _, heavy in expected for g in heavy})
     assert lifted.weights.shape == (len(expected), len(lifted.gaussians)) and lifted.weights.has_canonical_format
@@ -69,7 +69,7 @@ def test_a_view_is_lifted_alike_by_its_observation_its_weights_and_any_number_of
         for count in (1, nb.config.NUMBA_NUM_THREADS):
             nb.set_num_threads(count)
             operator, labels = make_operator(scene, view.camera), view.read_labels()
-            found += [Lifted.of(operator.observe(labels)), Lifted.of_weights(operator.lift(labels))]
+            found += [Lifted.of(operator.observe(labels).by_label()), Lifted.of(operator.lift(labels))]
     finally:
         nb.set_num_threads(threads)
     for other in found[1:]:

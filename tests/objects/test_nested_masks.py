@@ -62,7 +62,7 @@ def test_objects_that_lie_in_one_mask_while_each_has_its_own_stay_two() -> None:
 
 
 def test_objects_that_lie_in_one_mask_make_a_whole_of_half_that_agreement() -> None:
-    lifted = {v.name: Lifted.of(make_operator(SCENE, v.camera).observe(v.read_labels())) for v in clean_views(12)}
+    lifted = {v.name: Lifted.of(make_operator(SCENE, v.camera).lift(v.read_labels())) for v in clean_views(12)}
     nested = {name: replace(view, wholes=np.where(view.ids == 2, 1, view.ids)) for name, view in lifted.items()}
     tree = grow_tree(SCENE.means, TRUTH, NUM_CLASSES, nested, 0.6)
     assert tree.parents.tolist() == [-1, NUM_CLASSES, NUM_CLASSES, -1, -1]

@@ -36,7 +36,7 @@ VIEWS = clean_views(12)
 
 
 def grown(views: Sequence[View], level: float = 0.4) -> ObjectTree:
-    lifted = {v.name: Lifted.of(make_operator(SCENE, v.camera).observe(v.read_labels())) for v in views}
+    lifted = {v.name: Lifted.of(make_operator(SCENE, v.camera).lift(v.read_labels())) for v in views}
     return grow_tree(SCENE.means, TRUTH, NUM_CLASSES, lifted, level)
 
 
@@ -217,7 +217,7 @@ def test_every_node_is_shown_by_several_views() -> None:
     """The slow reading of what a segment has to be: it fits the node better than either of what merged to it."""
     views = views_in_halves()
     tree = grown(views)
-    lifted = {v.name: Lifted.of(make_operator(SCENE, v.camera).observe(v.read_labels())) for v in views}
+    lifted = {v.name: Lifted.of(make_operator(SCENE, v.camera).lift(v.read_labels())) for v in views}
     for part in tree.parts(1):
         inside = np.isin(tree.leaves, [part])
         shown = 0
