@@ -22,15 +22,15 @@ Nothing depends on the order of views or ids.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, replace
-from functools import cached_property
+from dataclasses import dataclass, field
 
 import numpy as np
 from scipy import sparse
 
 from gsseg_core.data.object_tree import ObjectTree
 from gsseg_core.objects.association import AssociationSettings
-from gsseg_core.objects.lifted_segments import Lifted, sums
+from gsseg_core.objects.lifted_segments import Lifted
+from gsseg_core.objects.sparse_products import grouping, sums
 from gsseg_core.objects.tree_kernels import Merged, Sight, cells, merge_regions, showing, staying
 from gsseg_core.spatial.row_order import rows_by_label
 
@@ -68,14 +68,17 @@ def grow_tree(
     settings: AssociationSettings | None = None,  # what of a view counts how much; `doubt` is the tree's own
 ) -> ObjectTree:
     """Find the parts of objects, and the wholes that they make."""
-    settings = replace(settings or AssociationSettings(), doubt=_DOUBT)
-    segments = _Segments.of(views, len(means), settings)
+    given = settings or AssociationSettings()
+    sight = Sight(_DOUBT, *(float(getattr(given, name)) for name in Sight._fields[1:]))
+    weights, segments = _stacked(views, len(means), sight)
     objects = [_Region(row=k) for k in range(num_classes)]
     places = np.where(classes >= 0, 0, -1)  # among the leaves of its object
     of_class, nobody = rows_by_label(classes), np.zeros(0, np.int64)
     members = [of_class.get(k, nobody) for k in range(num_classes)]
     for k in range(1, num_classes):
-        rows, own = segments.on(members[k])
+        rows = weights[members[k]]
+        used = np.unique(rows.indices)
+        rows, own = rows[:, used], segments.among(used)
         merged = _regions(means[members[k]], rows, own)
         tops = _kept(merged, own.showing(merged))
         found = _stepped(tops[0] if len(tops) == 1 else _Region(0.0, tops), level, 1.0)
@@ -88,67 +91,55 @@ def grow_tree(
         leaves = object_.leaves()
         for leaf, size in zip(leaves, np.bincount(places[members[k]], minlength=len(leaves)).tolist(), strict=True):
             leaf.size = size
-    return _numbered(objects, _wholes(objects, members, segments, level), members, places, level)
+    return _numbered(objects, _wholes(objects, members, weights, segments, level), members, places, level)
 
 
 @dataclass(frozen=True, eq=False)
 class _Segments:
-    """Segments of all views but their backgrounds, and how views compare regions by them."""
+    """Segments of several views, and how these compare regions by them."""
 
-    weights: sparse.csr_matrix  # (N, S), px
-    view: np.ndarray  # (S,): ascending, without gaps
+    view: np.ndarray  # (S,): ascending
     size: np.ndarray  # (S,), px
-    settings: AssociationSettings
+    sight: Sight
 
-    @classmethod
-    def of(cls, views: Mapping[str, Lifted], num_gaussians: int, settings: AssociationSettings) -> _Segments:
-        blocks = [sparse.csr_matrix((0, num_gaussians), dtype=np.float32)]
-        for name in sorted(views):
-            one = views[name]
-            every = one.of_all(num_gaussians, one.weights.data)
-            blocks += [every[one.ids != 0], one.wholes_of_several() @ every]
-        stacked, counts = sparse.vstack(blocks, format="csr"), [block.shape[0] for block in blocks]
-        view = np.unique(np.repeat(np.arange(len(blocks)), counts), return_inverse=True)[1]
-        return cls(stacked.T.tocsr(), view, sums(stacked, 1), settings)
-
-    def on(self, gaussians: np.ndarray) -> tuple[sparse.csr_matrix, _Segments]:
-        """Rows of some Gaussians (n, S'), and the segments that are on them."""
-        rows = self.weights[gaussians]
-        used = np.unique(rows.indices)
-        view = np.unique(self.view[used], return_inverse=True)[1]
-        return rows[:, used], _Segments(self.weights, view, self.size[used], self.settings)
+    def among(self, used: np.ndarray) -> _Segments:  # (S',)
+        """Take some of them, of views without gaps."""
+        return _Segments(np.unique(self.view[used], return_inverse=True)[1], self.size[used], self.sight)
 
     def seen(self, regions: np.ndarray) -> np.ndarray:
         """Sum up what each view sees of regions (R, S), in px, (R, views)."""
-        return np.add.reduceat(regions, self._firsts, axis=1) if len(self.view) else regions
+        firsts = np.flatnonzero(np.diff(self.view, prepend=-1))
+        return np.add.reduceat(regions, firsts, axis=1) if len(firsts) else regions
 
-    @cached_property
-    def _firsts(self) -> np.ndarray:
-        return np.flatnonzero(np.diff(self.view, prepend=-1))
+    def merged(self, rows: sparse.csr_matrix, groups: np.ndarray) -> Merged:
+        """Merge the regions that groups (n,) of Gaussians are, by rows (n, S): all on the way, parts before wholes."""
+        shares = (grouping(groups) @ rows.astype(np.float64)).toarray()
+        return merge_regions(shares, self.view, self.sight)
 
     def showing(self, merged: Merged) -> np.ndarray:
         """Which views show each region as a segment, (R, views) bool."""
-        return showing(merged.parts, merged.shares, self.view, self.size, _ITSELF, float(self.settings.full_sight_px))
+        return showing(merged.parts, merged.shares, self.view, self.size, _ITSELF, self.sight.full_sight_px)
+
+
+def _stacked(
+    views: Mapping[str, Lifted], num_gaussians: int, sight: Sight
+) -> tuple[sparse.csr_matrix, _Segments]:  # (N, S), px
+    """Stack the segments of all views but their backgrounds, and the wholes of several."""
+    blocks = [sparse.csr_matrix((0, num_gaussians), dtype=np.float32)]
+    for name in sorted(views):
+        one = views[name]
+        every = one.of_all(num_gaussians, one.weights.data)
+        blocks += [every[one.ids != 0], one.wholes_of_several() @ every]
+    stacked = sparse.vstack(blocks, format="csr")
+    view = np.repeat(np.arange(len(blocks)), [block.shape[0] for block in blocks])
+    every = _Segments(view, sums(stacked, 1), sight)
+    return stacked.T.tocsr(), every.among(np.arange(len(view)))
 
 
 def _regions(means: np.ndarray, rows: sparse.csr_matrix, segments: _Segments) -> Merged:
-    """Merge the cells of an object: all regions on the way, parts before wholes."""
+    """Merge the cells of an object."""
     seen = np.flatnonzero(np.diff(rows.indptr))
-    cell = cells(means[seen], max(float(_CELL), len(seen) / _MOST_CELLS))
-    return _merge(_summed(rows[seen], cell), segments)
-
-
-def _summed(rows: sparse.csr_matrix, groups: np.ndarray) -> np.ndarray:
-    """Add up rows (n, S) by group (n,), (groups, S) float64."""
-    shape = (int(groups.max(initial=-1)) + 1, len(groups))
-    grouping = sparse.csr_matrix((np.ones(len(groups)), (groups, np.arange(len(groups)))), shape=shape)
-    return np.asarray((grouping @ rows).toarray())
-
-
-def _merge(shares: np.ndarray, segments: _Segments) -> Merged:
-    """Merge regions (R, S), in every round those that agree with each other more than with any third."""
-    settings = segments.settings
-    return merge_regions(shares, segments.view, Sight(*(float(getattr(settings, name)) for name in Sight._fields)))
+    return segments.merged(rows[seen], cells(means[seen], max(float(_CELL), len(seen) / _MOST_CELLS)))
 
 
 def _kept(merged: Merged, shown: np.ndarray, objects: Sequence[_Region] = ()) -> list[_Region]:
@@ -192,13 +183,16 @@ def _nearest_part(
 
 
 def _wholes(
-    objects: Sequence[_Region], members: Sequence[np.ndarray], segments: _Segments, level: float
+    objects: Sequence[_Region],
+    members: Sequence[np.ndarray],
+    weights: sparse.csr_matrix,  # (N, S)
+    segments: _Segments,
+    level: float,
 ) -> list[_Region]:
     """Put objects together that several views show as one; leaves have the numbers of objects for rows."""
     present = [k for k in range(1, len(objects)) if len(members[k])]
-    groups, where = np.concatenate([[], *(np.full(len(members[k]), i) for i, k in enumerate(present))]), members[1:]
-    shares = _summed(segments.weights[np.concatenate([[], *where]).astype(np.int64)], groups.astype(np.int64))
-    merged = _merge(shares, segments)
+    groups = np.repeat(np.arange(len(present)), np.array([len(members[k]) for k in present], np.int64))
+    merged = segments.merged(weights[np.concatenate([np.zeros(0, np.int64), *members[1:]])], groups)
     tops = _kept(merged, segments.showing(merged), [_Region(row=k) for k in present])
     below = float(np.nextafter(np.float32(level), np.float32(0)))
     todo, found = [_stepped(region, 0.0, below) for region in tops], list[_Region]()
