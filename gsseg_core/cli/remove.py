@@ -36,17 +36,15 @@ def run(options: argparse.Namespace) -> int:
     """Remove, and say what is left."""
     from pathlib import Path
 
-    import numpy as np
-
     from gsseg_core.data.class_names import class_ids, listed
     from gsseg_core.export.class_files import write_selection
-    from gsseg_core.export.collision import check_collision, collision_meshes
+    from gsseg_core.export.collision import check_collision
     from gsseg_core.files.atomic import check_replaceable, check_writable
     from gsseg_core.objects.removal import left_without
     from gsseg_core.scene.gaussian_scene import GaussianScene
     from gsseg_core.scene.scene_formats import find_format
     from gsseg_core.scene.scene_writers import SCENE_WRITERS, check_format, format_of
-    from gsseg_core.segmentation import REMOVED, Segmentation
+    from gsseg_core.segmentation import Segmentation
     from gsseg_core.text import clipped, counted
 
     check_writable(options.out)
@@ -63,11 +61,11 @@ def run(options: argparse.Namespace) -> int:
     names = segmentation.node_names
     chosen = class_ids(options.classes, names, options.segmentation)
     rest = left_without(scene, segmentation, chosen)
-    left = np.where(rest, segmentation.labels, REMOVED)
     with progress_bars(options.quiet) as progress:
-        made = collision_meshes(scene, left, segmentation.confidence, options.collision, progress)
-    meshes = made if options.collision else None
-    write_selection(scene, rest, segmentation.labels, segmentation.class_names, options.out, scene_format, meshes)
+        write_selection(
+            scene, rest, segmentation.labels, segmentation.confidence, segmentation.class_names, options.out,
+            scene_format, options.collision, progress,
+        )  # fmt: skip
     removed = listed(f"{k} ({clipped(names[k])})" for k in chosen)
     tell(f"without {removed}: {int(rest.sum()):,} of {counted(len(scene), 'Gaussian')} in {options.out}")
     return 0

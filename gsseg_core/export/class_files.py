@@ -15,12 +15,13 @@ from numpy.lib.recfunctions import repack_fields
 from gsseg_core.export.collision import check_collision, collision_meshes
 from gsseg_core.files.atomic import check_replaceable, write_atomically
 from gsseg_core.files.run_folder import staged_run
+from gsseg_core.progress import Progress, silent
 from gsseg_core.scene.gaussian_scene import GaussianScene
 from gsseg_core.scene.ply import write_parts
 from gsseg_core.scene.scene_writers import DEFAULT, SCENE_WRITERS, SceneObject, check_format, write_objects, write_scene
 from gsseg_core.scene.triangle_mesh import LONE, TriangleMesh
 from gsseg_core.scene.vertices import chosen
-from gsseg_core.segmentation import Segmentation
+from gsseg_core.segmentation import REMOVED, Segmentation
 from gsseg_core.spatial.row_order import rows_by_label, take_rows_into
 
 TOGETHER = "objects"  # stem of the file in which a format keeps the objects of all classes
@@ -114,38 +115,42 @@ def write_selection(
     scene: GaussianScene,
     chosen: np.ndarray,  # (N,) bool
     labels: np.ndarray,  # (N,) int
+    confidence: np.ndarray,  # (N,)
     class_names: Mapping[int, str],
     path: str | os.PathLike[str],
     scene_format: str,
-    meshes: Mapping[int, TriangleMesh] | None,  # None where none were asked for
+    collision: str | None = None,
+    progress: Progress = silent,  # of making meshes
 ) -> None:
     """Write some Gaussians of a scene as one file, in which USD keeps the classes of these labels apart.
 
-    Meshes to collide with go into the USD, or beside another file, as `<its stem>_<id>_<name>.obj`; those that an
-    earlier call wrote there for other classes are removed. If anything cannot be written, all files are as they were.
-    Raises what `gsseg_core.scene.scene_writers.write_scene` does, `EmptySceneError` where none is chosen, and
-    `PathTakenError` where a file that is none of these is in the place of a mesh.
+    Meshes to collide with, of a kind if one is given, are of what is chosen. They go into the USD, or beside another
+    file, as `<its stem>_<id>_<name>.obj`; those that an earlier call wrote there for other classes are removed. If
+    anything cannot be written, all files are as they were. Raises what `gsseg_core.scene.scene_writers.write_scene` and
+    `check_collision` do, `EmptySceneError` where none is chosen, and `PathTakenError` where a file that is none of
+    these is in the place of a mesh.
     """
     part = scene.subset(chosen)
-    if not SCENE_WRITERS[scene_format].together:
-        stem = stem_of(path, scene_format)
-        places = {k: Path(path).with_name(f"{stem}_{mesh_file_name(k, name)}") for k, name in class_names.items()}
-        for k in meshes or {}:
-            check_replaceable(places[k], "mesh of an earlier call", _is_lone_mesh(places[k]))
-        with ExitStack() as written:  # Meshes get their names once the scene has its own.
-            for k, mesh in (meshes or {}).items():
-                mesh.write(written.enter_context(write_atomically(places[k])))
-            write_scene(part, path, scene_format)
-        for k in () if meshes is None else places.keys() - meshes.keys():
-            if _is_lone_mesh(places[k]) and not places[k].is_symlink():
-                with suppress(OSError):
-                    places[k].unlink()
+    meshes = collision_meshes(scene, np.where(chosen, labels, REMOVED), confidence, collision, progress)
+    if SCENE_WRITERS[scene_format].together:
+        labels = labels[chosen]
+        objects = _objects(part, _members(labels), class_names, meshes)
+        if (labels < 0).any():
+            objects.append(SceneObject(part.subset(labels < 0)))
+        write_objects(objects, path, scene_format)
         return
-    labels = labels[chosen]
-    objects = _objects(part, _members(labels), class_names, meshes or {})
-    if (labels < 0).any():
-        objects.append(SceneObject(part.subset(labels < 0)))
-    write_objects(objects, path, scene_format)
+    stem = stem_of(path, scene_format)
+    places = {k: Path(path).with_name(f"{stem}_{mesh_file_name(k, name)}") for k, name in class_names.items()}
+    for k in meshes:
+        check_replaceable(places[k], "mesh of an earlier call", _is_lone_mesh(places[k]))
+    with ExitStack() as written:  # Meshes get their names once the scene has its own.
+        for k, mesh in meshes.items():
+            mesh.write(written.enter_context(write_atomically(places[k])))
+        write_scene(part, path, scene_format)
+    for k in places.keys() - meshes.keys() if collision else ():
+        if _is_lone_mesh(places[k]) and not places[k].is_symlink():
+            with suppress(OSError):
+                places[k].unlink()
 
 
 def _is_lone_mesh(path: Path) -> bool:

@@ -107,13 +107,13 @@ class Answer:
     def _told(self, picked: Picked, votes: Sequence[ViewVote] | None) -> str:
         model, classes = self._state.model, self._state.objects.class_names
         i = picked.gaussian
-        labels, shares, names, _ = model.labelling
-        label, probabilities = int(labels[i]), shares.take(np.array([i])).dense(len(names))[0]
+        known = model.labelling
+        label, probabilities = int(known.labels[i]), known.shares.take(np.array([i])).dense(len(known.class_names))[0]
         least = min(_LEAST, max(probabilities.max(), 1e-9))
         ranked = np.argsort(-probabilities, kind="stable")[:MOST_CLASSES].tolist()
         best = [k for k in ranked if probabilities[k] >= least]
-        known = _told_apart({k: model.name(k) for k in best}, model.ids())
-        likely = ", ".join(f"{known[k]} {probabilities[k]:.2f}" for k in best)
+        names = _told_apart({k: model.name(k) for k in best}, model.ids())
+        likely = ", ".join(f"{names[k]} {probabilities[k]:.2f}" for k in best)
         lines = [
             f", class {model.ids()[label]}" if label >= 0 else "",
             f"Gaussian {i}, {100 * picked.weight:.0f} % of the pixel",
@@ -122,8 +122,8 @@ class Answer:
         if votes is not None:
             views = counted(len({vote.view for vote in votes}), "view")
             lines.append(f"{views} voted for it" + (", the largest votes:" if votes else ""))
-            known = _told_apart({v.label: class_name(classes, v.label) for v in votes[:MOST_VIEWS]}, model.class_ids)
-            lines += [f"{_isolated(v.view)}: {known[v.label]}, {v.weight:.1f} px" for v in votes[:MOST_VIEWS]]
+            names = _told_apart({v.label: class_name(classes, v.label) for v in votes[:MOST_VIEWS]}, model.class_ids)
+            lines += [f"{_isolated(v.view)}: {names[v.label]}, {v.weight:.1f} px" for v in votes[:MOST_VIEWS]]
         return _of_html(*lines, title=shown_name(model.name(label)))
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import NamedTuple
 
@@ -28,7 +28,8 @@ NOTHING_KNOWN = (120, 120, 120)  # colour of Gaussians without a value in the pr
 _RAMP = np.array([(122, 1, 30), (230, 120, 40), (250, 230, 140), (90, 180, 140), (0, 90, 130)], np.float32)
 
 
-class Labelling(NamedTuple):
+@dataclass(frozen=True, eq=False)
+class Labelling:
     """Label and class probabilities of each Gaussian, from a segmentation, a live source or corrections."""
 
     labels: np.ndarray  # (N,) int32: class, or `UNOBSERVED` (-1), or `REMOVED` (-2)
@@ -48,9 +49,17 @@ class Labelling(NamedTuple):
         names = {k: class_name(names, k) for k in range(max(names) + 1)}
         return cls(np.full(num_gaussians, UNOBSERVED, np.int32), CSRRows.empty(num_gaussians), names)
 
+    @cached_property
     def confidence(self) -> np.ndarray:
         """Largest probability of each Gaussian, (N,) float32; 0 where nothing is known."""
         return np.asarray(largest(self.shares)[0])
+
+    @cached_property
+    def palette(self) -> np.ndarray:
+        """Colours by label, (K + 2, 3) uint8: labels -1 and -2, which are no class, are its last two."""
+        nodes = self.nodes or range(max(self.class_names, default=0) + 1)
+        colors = palette(max(nodes) + 1)[list(nodes)]
+        return np.concatenate([colors, np.array([NOTHING_KNOWN] * len(NO_CLASS), np.uint8)])
 
 
 def at_level(objects: Labelling, tree: ObjectTree, granularity: float) -> Labelling:
@@ -61,7 +70,7 @@ def at_level(objects: Labelling, tree: ObjectTree, granularity: float) -> Labell
     k, added = tree.num_classes, len(objects.class_names) - tree.num_classes
     of_added = range(len(tree), len(tree) + added)
     if granularity == tree.level:
-        return objects._replace(nodes=(*range(k), *of_added)) if added else objects
+        return replace(objects, nodes=(*range(k), *of_added)) if added else objects
     in_tree = objects.shares.indices < k
     shares, nodes = tree.shares_at(granularity, objects.shares.entries(in_tree), tree.leaves)
     of_tree, first = objects.labels < k, len(nodes)
@@ -92,7 +101,7 @@ class ViewModel:
     """The state of a viewer. Change it with its methods; `shown` and `colors` say what follows from it."""
 
     scene: GaussianScene  # N Gaussians
-    labelling: Labelling  # what is known of them; replaced as a whole by `relabel`
+    labelling: Labelling  # what is known of them; replaced as a whole, and what was switched off stays so
     reliability: np.ndarray | None = None  # (N,) float32: mean over the views that saw each, or NaN; None if unknown
     mode: str = BY_CLASS  # one of `MODES`
     min_confidence: float = 0.0  # Gaussians that are less sure of their own class are not shown
@@ -110,17 +119,6 @@ class ViewModel:
         given, count = {*self.class_ids}, len(self.labelling.class_names)
         free = (i for i in range(len(given) + count) if i not in given)
         return [*self.class_ids, *free][:count]
-
-    def relabel(self, labelling: Labelling) -> None:
-        """Show what is known now; what was switched off stays so."""
-        self.labelling = labelling
-        for of_the_last in ("confidence", "_palette"):
-            self.__dict__.pop(of_the_last, None)
-
-    @cached_property
-    def confidence(self) -> np.ndarray:
-        """Largest probability of each Gaussian, (N,) float32; 0 where nothing is known."""
-        return self.labelling.confidence()
 
     @property
     def labels_in_use(self) -> list[int]:
@@ -140,7 +138,7 @@ class ViewModel:
 
     def color(self, label: int) -> tuple[int, int, int]:
         """Colour of a label."""
-        red, green, blue = self._palette[label].tolist()
+        red, green, blue = self.labelling.palette[label].tolist()
         return red, green, blue
 
     def toggle(self, label: int) -> None:
@@ -164,41 +162,34 @@ class ViewModel:
 
     def shown(self) -> np.ndarray:
         """Which Gaussians are shown, (N,) bool."""
-        off = self.hidden | self.removed
-        labels, shares, names, _ = self.labelling
-        on = np.ones(len(names) + len(NO_CLASS), bool)  # labels -1 and -2 are its last two
-        on[[k for k in off if k < len(names)]] = False
-        kept: np.ndarray = on[labels]
+        known, num_classes = self.labelling, len(self.labelling.class_names)
+        on = np.ones(num_classes + len(NO_CLASS), bool)  # labels -1 and -2 are its last two
+        on[[k for k in self.hidden | self.removed if k < num_classes]] = False
+        kept: np.ndarray = on[known.labels]
         if self.min_probability > 0:
-            kept = largest(shares.with_data(shares.data * on[shares.indices]))[0] >= np.float32(self.min_probability)
+            on_alone = known.shares.with_data(known.shares.data * on[known.shares.indices])
+            kept = largest(on_alone)[0] >= np.float32(self.min_probability)
         if self.min_confidence > 0:
-            kept &= self.confidence >= np.float32(self.min_confidence)
+            kept &= known.confidence >= np.float32(self.min_confidence)
         return kept
 
     def colors(self) -> np.ndarray:
         """Colour of every Gaussian in the present mode, (N, 3) uint8."""
         if self.mode == TRUE_COLOURS:
             return self._true_colors
+        known = self.labelling
         if self.mode == BY_CONFIDENCE:
-            return ramp(np.where(self.confidence > 0, self.confidence, np.nan))
+            return ramp(np.where(known.confidence > 0, known.confidence, np.nan))
         if self.mode == BY_RELIABILITY:
             nothing = np.full(len(self.scene), np.nan, np.float32)
             return ramp(nothing if self.reliability is None else self.reliability)
-        colors = self._palette
-        by_class: np.ndarray = colors[self.labelling.labels]
+        by_class: np.ndarray = known.palette[known.labels]
         # What refinement took out lies across an edge: in one colour it would be a stain on what it covers.
-        out, num_classes = np.flatnonzero(self.labelling.labels == REMOVED), len(self.labelling.class_names)
-        by_class[out] = np.rint(self.labelling.shares.take(out).dense(num_classes) @ colors[:num_classes])
+        out, num_classes = np.flatnonzero(known.labels == REMOVED), len(known.class_names)
+        by_class[out] = np.rint(known.shares.take(out).dense(num_classes) @ known.palette[:num_classes])
         # Light and shade stay, as in the overlays.
         grey = self._true_colors.mean(axis=1, keepdims=True, dtype=np.float32)
         return np.rint(grey + FILL * (by_class - grey)).astype(np.uint8)
-
-    @cached_property
-    def _palette(self) -> np.ndarray:
-        """Colours by label, (K + 2, 3) uint8: labels -1 and -2, which are no class, are its last two."""
-        nodes = self.labelling.nodes or range(max(self.labelling.class_names, default=0) + 1)
-        colors = palette(max(nodes) + 1)[list(nodes)]
-        return np.concatenate([colors, np.array([NOTHING_KNOWN] * len(NO_CLASS), np.uint8)])
 
     @cached_property
     def _true_colors(self) -> np.ndarray:

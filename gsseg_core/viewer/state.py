@@ -19,7 +19,7 @@ from gsseg_core.data.object_tree import ObjectTree
 from gsseg_core.data.view import View
 from gsseg_core.errors import SettingsError
 from gsseg_core.export.class_files import write_selection
-from gsseg_core.export.collision import check_collision, collision_meshes
+from gsseg_core.export.collision import check_collision
 from gsseg_core.progress import Progress, silent
 from gsseg_core.raster.backends import make_operator
 from gsseg_core.scene.camera import Camera
@@ -46,7 +46,7 @@ class ViewerState:
         self._view_votes: ViewVotes | None = None
         self._view_votes_lock = threading.Lock()
         self.lock = threading.RLock()  # held by whoever needs that nothing of this changes meanwhile
-        self._parts = cut(model.labelling.labels, model.confidence)
+        self._parts = cut(model.labelling.labels, model.labelling.confidence)
 
     def seen(self) -> tuple[Picture, list[ClassRow]]:
         """Return the scene as it is to be seen now, and the list of classes."""
@@ -177,26 +177,23 @@ class ViewerState:
         if collision and not SCENE_WRITERS[scene_format].together:
             raise SettingsError(f"format {scene_format}: holds no meshes to collide with; expected usd, or none")
         with self.lock:
-            shown, (labels, _, names, _) = self.model.shown(), self.model.labelling
-            scene, ids, confidence = self.model.scene, self.model.ids(), self.model.confidence
+            scene, shown, known, ids = self.model.scene, self.model.shown(), self.model.labelling, self.model.ids()
         name = f"selection{SCENE_WRITERS[scene_format].suffixes[0]}"
-        given = np.array([*ids, REMOVED, UNOBSERVED])[labels]  # labels -1 and -2 are its last two
-        known = {ids[k]: text for k, text in names.items()}
-        meshes = collision_meshes(scene, np.where(shown, given, REMOVED), confidence, collision)
-        return name, _as_file(
-            lambda path: write_selection(scene, shown, given, known, path, scene_format, meshes or None), name
-        )
+        given = np.array([*ids, REMOVED, UNOBSERVED])[known.labels]  # labels -1 and -2 are its last two
+        names = {ids[k]: text for k, text in known.class_names.items()}
+        selected = scene, shown, given, known.confidence, names
+        return name, _as_file(lambda path: write_selection(*selected, path, scene_format, collision), name)
 
     def segmentation_npz(self) -> tuple[str, bytes]:
         """Write labels and class probabilities, corrections included: the name `segmentation.npz`, and its bytes."""
         with self.lock:
             objects, tree, read = self.objects, self.model.tree, self.model.read
             ids = self.model.ids() if tree is None else at_level(objects, tree, tree.level).nodes
-        (labels, told, names, _), scene = objects, self.model.scene
-        shares, nothing = completed(told, len(names)), np.zeros(len(labels), bool)
-        result = Segmentation(labels, shares, names, scene.digest, nothing, CSRRows.empty(0), ids=scene.ids)
+        scene, names, nothing = self.model.scene, objects.class_names, np.zeros(len(objects.labels), bool)
+        shares = completed(objects.shares, len(names))
+        result = Segmentation(objects.labels, shares, names, scene.digest, nothing, CSRRows.empty(0), ids=scene.ids)
         if read is not None:  # What blends into views is what was learnt, but for what was corrected.
-            now, then = told.united(read.shares)
+            now, then = objects.shares.united(read.shares)
             same = now.with_data(now.data != then.data).sums() == 0
             learnt = read.learnt.take(np.flatnonzero(same[read.clustered]))
             result = replace(result, clustered=read.clustered & same, learnt=learnt, temperature=read.temperature)
@@ -221,9 +218,9 @@ class ViewerState:
         """Show what follows from the corrections, at a level; all of it, or nothing where memory runs out."""
         objects, tree = self.corrections.apply(self._learnt, self.added_names), self.model.tree
         shown = at_level(objects, tree, granularity) if tree else objects
-        self._parts = cut(shown.labels, shown.confidence())
+        self._parts = cut(shown.labels, shown.confidence)
         self.objects, self.granularity = objects, granularity
-        self.model.relabel(shown)
+        self.model.labelling = shown
         self.stale.set()
 
 

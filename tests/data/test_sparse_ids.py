@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import resource
 import shutil
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -190,7 +191,7 @@ def test_the_viewer_numbers_classes_and_saves_the_users_ids() -> None:
     gaps = Segmentation.from_codes(SCENE, codes, NAMES).with_ids(IDS.tolist())
     model = ViewModel(SCENE, Labelling.of(gaps.numbered()), class_ids=tuple(gaps.class_ids.tolist()))
     assert model.ids() == IDS.tolist() and model.colors().shape == (len(SCENE), 3)
-    model.relabel(model.labelling._replace(class_names={**model.labelling.class_names, 4: "added"}))
+    model.labelling = replace(model.labelling, class_names={**model.labelling.class_names, 4: "added"})
     assert model.ids() == [*IDS.tolist(), 2]
 
 

@@ -28,6 +28,7 @@ from gsseg_core.scene.triangle_mesh import TriangleMesh
 from gsseg_core.segmentation import Segmentation
 
 SCENE, TRUTH = balls_on_a_table()
+SURE = np.ones(len(SCENE), np.float32)
 HOSTILE = {
     0: "background", 1: "<script>alert(1)</script>", 2: "../../etc/passwd", 3: "x" * MAX_CLASS_NAME,
 }  # fmt: skip
@@ -50,7 +51,7 @@ def meshes_of(kind: str | None) -> dict[int, TriangleMesh]:
 @pytest.fixture
 def meshes_made_once(monkeypatch: pytest.MonkeyPatch) -> None:
     """Have the meshes of SCENE made once, which takes most of the time; for tests of what is written of them."""
-    monkeypatch.setattr(class_files, "collision_meshes", lambda *of: meshes_of(of[-1]))
+    monkeypatch.setattr(class_files, "collision_meshes", lambda scene, labels, confidence, kind, *_: meshes_of(kind))
 
 
 def visible(folder: Path) -> list[str]:
@@ -265,13 +266,13 @@ def test_an_object_of_one_gaussian_has_a_mesh_and_one_that_is_not_opaque_has_non
 
 def test_a_selection_in_usd_keeps_its_classes_apart(tmp_path: Path) -> None:
     labels = np.where(TRUTH == 3, -2, TRUTH)
-    write_selection(SCENE, TRUTH != 0, labels, NAMES, tmp_path / "selection.usda", "usd", {})
+    write_selection(SCENE, TRUTH != 0, labels, SURE, NAMES, tmp_path / "selection.usda", "usd")
     stage = Usd.Stage.Open(str(tmp_path / "selection.usda"))
     assert [prim.GetName() for prim in stage.GetDefaultPrim().GetChildren()] == [
         "class_1_red_ball", "class_2_cup_mug", "scene",
     ]  # fmt: skip
     with pytest.raises(EmptySceneError):
-        write_selection(SCENE, TRUTH > 9, labels, NAMES, tmp_path / "none.usda", "usd", {})
+        write_selection(SCENE, TRUTH > 9, labels, SURE, NAMES, tmp_path / "none.usda", "usd")
     assert not (tmp_path / "none.usda").exists()
 
 
@@ -279,7 +280,7 @@ def test_a_selection_replaces_no_mesh_of_others(tmp_path: Path) -> None:
     edited = tmp_path / "rest_2_cup_mug.obj"
     edited.write_text("# Blender\n")
     with pytest.raises(PathTakenError, match=r"rest_2_cup_mug\.obj: is there and is no mesh of an earlier call"):
-        write_selection(SCENE, TRUTH < 9, TRUTH, NAMES, tmp_path / "rest.ply", "ply", meshes_of(HULL))
+        write_selection(SCENE, TRUTH < 9, TRUTH, SURE, NAMES, tmp_path / "rest.ply", "ply", HULL)
     assert visible(tmp_path) == [edited.name] and edited.read_text() == "# Blender\n"
 
 

@@ -56,7 +56,7 @@ def test_live_codes_are_those_of_the_node_wherever_the_scene_lies_in_the_map(ros
             update = next_update(source)
             client.export("out", refine="paper", filter=False)
         truth = Segmentation.load(tmp_path / "out/segmentation.npz", scene)
-        labels, _, names, _ = update.labelling
+        labels, names = update.labelling.labels, update.labelling.class_names
         probabilities = probabilities_of(update.labelling)
         assert names == NAMES and update.num_views == 4
         truth = truth.filtered(scene, PAPER)

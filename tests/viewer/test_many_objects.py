@@ -109,6 +109,6 @@ def test_a_press_on_one_of_many_classes_takes_time_by_their_number_and_not_by_it
     model.isolate(7)
     model.remove(8)
     assert len(model.rows()) == count - 1 and model.ids()[-1] == count + 4
-    model.relabel(Labelling.of(segmentation))
+    model.labelling = Labelling.of(segmentation)
     model.toggle(9)
     assert len(looks) <= 5 * count

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from contextlib import closing
+from dataclasses import replace
 from pathlib import Path
 from unittest.mock import MagicMock
 
@@ -73,7 +74,7 @@ def test_the_answer_to_a_click_follows_corrections_and_what_takes_them_back(view
 
 
 def test_names_that_are_read_from_the_right_leave_numbers_beside_them_in_order() -> None:
-    named = LEARNT._replace(class_names={k: "\u05db\u05d9\u05e1\u05d0 " * k for k in NAMES})
+    named = replace(LEARNT, class_names={k: "\u05db\u05d9\u05e1\u05d0 " * k for k in NAMES})
     with closing(Viewer(ViewModel(SCENE, named), listener=listen(port=PORT), draw=SERVER)) as opened:
         answer, name = opened.panel.answer, f"<bdi>{named.class_names[1]}</bdi>"
         answer.show_picked(answer.ask(), Picked(IN_BALL, 0.5), [ViewVote("view", 1, 2.5)])
@@ -82,7 +83,7 @@ def test_names_that_are_read_from_the_right_leave_numbers_beside_them_in_order()
 
 
 def test_buttons_of_names_that_are_read_from_the_right_keep_their_numbers_and_are_found_by_composed_letters() -> None:
-    named = LEARNT._replace(class_names={0: "table", 1: "\u05db\u05d9\u05e1\u05d0", 2: "Tu\u0308r", 3: "box"})
+    named = replace(LEARNT, class_names={0: "table", 1: "\u05db\u05d9\u05e1\u05d0", 2: "Tu\u0308r", 3: "box"})
     with closing(Viewer(ViewModel(SCENE, named), listener=listen(port=PORT), draw=SERVER)) as opened:
         panel = opened.panel
         labels = {row.label: button.label for row, button in panel._rows.values()}

@@ -30,7 +30,7 @@ CAMERA = clean_views(1)[0].camera
 
 
 def picture(shown: np.ndarray) -> Picture:
-    return Picture(SCENE, cut(MODEL.labelling.labels, MODEL.confidence), shown, MODEL.colors())
+    return Picture(SCENE, cut(MODEL.labelling.labels, MODEL.labelling.confidence), shown, MODEL.colors())
 
 
 class Client:

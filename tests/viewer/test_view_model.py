@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from contextlib import AbstractContextManager, nullcontext
+from dataclasses import replace
 from io import BytesIO
 from pathlib import Path
 from types import SimpleNamespace
@@ -181,7 +182,7 @@ OPACITIES = np.rint(255 * SCENE.opacities).astype(np.uint8)
 
 
 def wanted(shown: ViewModel) -> dict[tuple[int, int], Node]:
-    parts = cut(shown.labelling.labels, shown.confidence)
+    parts = cut(shown.labelling.labels, shown.labelling.confidence)
     return Picture(SCENE, parts, shown.shown(), shown.colors()).nodes
 
 
@@ -205,7 +206,7 @@ def test_what_the_browser_has_is_what_is_wanted_whatever_happens() -> None:
         elif step == 5:
             shown.show_all()
         elif step == 6:
-            shown.relabel(shown.labelling._replace(labels=np.roll(shown.labelling.labels, 3)))
+            shown.labelling = replace(shown.labelling, labels=np.roll(shown.labelling.labels, 3))
         else:
             shown.toggle(label)
         browser.show(wanted(shown))
@@ -344,7 +345,7 @@ def test_a_class_that_was_added_stays_apart_from_those_that_turn_up_in_a_live_so
     assert state.correct(disc(camera, *uv, 3, K)) > 0
     spoon = state.objects.labels == K
     state.model.toggle(K)
-    labels, _, names, _ = state._learnt
+    labels, names = state._learnt.labels, state._learnt.class_names
     wider = np.pad(probabilities_of(state._learnt), ((0, 0), (0, 1)))
     state.replace(labelled(labels, wider, {**names, K: "fork"}))
     np.testing.assert_array_equal(state.objects.labels == K + 1, spoon)

@@ -24,10 +24,12 @@ pytest.importorskip("viser")
 
 from viser.infra._infra import WebsockServer
 
+from gsseg_core.csr_rows import CSRRows, largest
+from gsseg_core.export import class_files
 from gsseg_core.scene.camera import Camera
 from gsseg_core.segmentation import Segmentation
 from gsseg_core.viewer import corrections as view_corrections
-from gsseg_core.viewer import state as view_state
+from gsseg_core.viewer import model as view_model
 from gsseg_core.viewer import viewer as viewer_module
 from gsseg_core.viewer.access import listen
 from gsseg_core.viewer.clients import SERVER, ClientRenderers
@@ -118,7 +120,7 @@ def test_a_class_that_was_added_joins_its_namesake_wherever_that_turns_up() -> N
     state.added_names[K] = "spoon"
     state.correct(disc(CAMERA, COLUMN, ROW, 3, K))
     spoon = state.objects.labels == K
-    state.replace(LEARNT._replace(class_names={**NAMES, 3: "spoon"}))
+    state.replace(replace(LEARNT, class_names={**NAMES, 3: "spoon"}))
     assert state.objects.class_names == {**NAMES, 3: "spoon"} and (state.objects.labels[spoon] == 3).all()
 
 
@@ -135,7 +137,7 @@ def test_corrections_and_switches_stay_with_their_class_though_a_robot_that_was_
         state.replace(Labelling.unknown(len(SCENE)))
         assert state.objects.class_names[3] == NAMES[3] and (state.objects.labels[drawn] == 3).all()
     names = {0: NAMES[0], 1: NAMES[3] if comes_back else "chair", 2: NAMES[1], 3: NAMES[2]}
-    state.replace(LEARNT._replace(labels=np.array([0, 2, 3, 1], np.int32)[TRUTH], class_names=names))
+    state.replace(replace(LEARNT, labels=np.array([0, 2, 3, 1], np.int32)[TRUTH], class_names=names))
     (label,) = set(state.objects.labels[drawn].tolist())
     assert state.objects.class_names[label] == NAMES[3] and state.model.hidden == {label}
     assert label == (1 if comes_back else 4)
@@ -144,7 +146,7 @@ def test_corrections_and_switches_stay_with_their_class_though_a_robot_that_was_
 def test_a_class_alone_is_joined_by_all_again_though_a_hidden_one_was_corrected_away() -> None:
     state = state_of()
     state.change(lambda model: model.isolate(3))
-    state.replace(LEARNT._replace(labels=np.where(TRUTH == 2, 3, TRUTH).astype(np.int32)))
+    state.replace(replace(LEARNT, labels=np.where(TRUTH == 2, 3, TRUTH).astype(np.int32)))
     state.change(lambda model: model.isolate(3))
     assert state.model.shown().all()
 
@@ -163,7 +165,7 @@ def test_the_class_that_corrections_are_for_stays_chosen_under_another_name_and_
     panel, target = viewer.panel, viewer.panel._target
     viewer.state.model.tree = None  # A live source has none.
     target.value = NAMES[3]
-    viewer.state.replace(LEARNT._replace(class_names={**NAMES, 3: "bottle"}))
+    viewer.state.replace(replace(LEARNT, class_names={**NAMES, 3: "bottle"}))
     wait_until(lambda: target.value != NAMES[3], "the other name")
     assert target.value == "bottle" and panel._label() == 3
     viewer.state.replace(Labelling.unknown(len(SCENE)))
@@ -264,31 +266,31 @@ def test_meshes_are_of_what_was_sure_when_saving_began_though_a_live_source_is_l
         at_once()
         return choose(*of)
 
-    def meshes(scene: object, labels: object, confidence: np.ndarray, kind: object) -> dict[int, object]:
+    def meshes(scene: object, labels: object, confidence: np.ndarray, *_: object) -> dict[int, object]:
         given.append(confidence)
         return {}
 
     monkeypatch.setattr(np, "where", where)
-    monkeypatch.setattr(view_state, "collision_meshes", meshes)
+    monkeypatch.setattr(class_files, "collision_meshes", meshes)
     viewed.selection("ply")
-    assert (viewed.model.confidence == 0).all() and (given[0] == np.float32(0.9)).all()
+    assert (viewed.model.labelling.confidence == 0).all() and (given[0] == np.float32(0.9)).all()
 
 
 def test_what_a_click_looks_through_is_known_anew_though_a_live_source_was_less_sure_meanwhile(
     viewer: Viewer, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    viewed, confidence = viewer.state, Labelling.confidence
+    viewed = viewer.state
     viewed.model.tree, viewed.model.min_confidence = None, 0.5
-    less_sure = LEARNT._replace(shares=LEARNT.shares.with_data(LEARNT.shares.data / 2))
+    less_sure = replace(LEARNT, shares=LEARNT.shares.with_data(LEARNT.shares.data / 2))
     at_once = meanwhile(viewed, lambda: viewed.replace(less_sure))
 
-    def known(labelling: Labelling) -> np.ndarray:
-        found = confidence(labelling)
+    def known(shares: CSRRows) -> tuple[np.ndarray, np.ndarray]:
+        found = largest(shares)
         at_once()
         return found
 
-    viewed.model.relabel(LEARNT)
-    monkeypatch.setattr(Labelling, "confidence", known)
+    viewed.model.labelling = replace(LEARNT)  # whose confidence nobody has asked for yet
+    monkeypatch.setattr(view_model, "largest", known)
     seen = MagicMock(fov=1.0, aspect=1.0, image_height=48, position=CAMERA.center, wxyz=np.eye(4)[0])
     viewer._on_click(MagicMock(client=MagicMock(camera=seen), ray_origin=np.zeros(3), ray_direction=np.eye(3)[2]))
     at_once()
