@@ -6,6 +6,7 @@ from abc import ABC, abstractmethod
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import closing
+from functools import partial
 from typing import Any, TypeVar
 
 import numpy as np
@@ -16,6 +17,7 @@ from gsseg_core.data.soft_masks import SeenLabels
 from gsseg_core.data.view import View
 from gsseg_core.errors import NoUsableViewsError, SettingsError, StateMismatchError
 from gsseg_core.files.limits import MAX_LABEL
+from gsseg_core.learn.all_or_nothing import Undo, all_or_nothing
 from gsseg_core.learn.learner_state import State
 from gsseg_core.learn.prepared_views import PreparedViews, default_budget
 from gsseg_core.learn.usable_views import SEES_NOTHING, UnusableViewError, read_mask, read_usable_mask
@@ -320,16 +322,14 @@ class Learner(ABC):
         if isinstance(opened, UnusableViewError):
             self.rejected[view.name] = str(opened)
             return False
-        total = self._votes if total is None else total
+        undo: list[Undo] = []
         if opened is not None:  # First: where there is no memory for its votes, the view in whose place it comes stays.
-            opened.vote(total)
-        try:
+            vote = partial(opened.vote, self._votes if total is None else total)
+            vote()
+            undo.append(partial(vote, sign=-1))
+        with all_or_nothing(*undo):
             if view.name in self.views:
                 self.retract(view.name)
-        except BaseException:
-            if opened is not None:
-                opened.vote(total, sign=-1)
-            raise
         self.rejected.pop(view.name, None)
         self.views[view.name] = view
         if opened is not None:
@@ -376,13 +376,13 @@ class Learner(ABC):
     def _finish(self) -> None:
         """Clear codes without evidence, and impute those of Gaussians with votes only against classes."""
         votes = self._votes.rows()
-        unsure, against = ~self.observed_, weigh_votes(votes)[1] < 0
+        against = weigh_votes(votes)[1] < 0
         # A Gaussian with votes for a class that is not `observed_` was seen in rejected regions only: it stays unknown.
-        codes = self.code_rows_.only(~(unsure & ~against))
-        if (unsure & against).any():
-            codes = impute_probabilities(codes, votes, self._possible(), np.flatnonzero(unsure & against))
-            self.observed_[unsure] = codes.known()[unsure]
-        self.code_rows_ = codes
+        self.code_rows_ = self.code_rows_.only(self.observed_ | against)
+        unsure = np.flatnonzero(against & ~self.observed_)
+        if len(unsure):
+            self.code_rows_ = impute_probabilities(self.code_rows_, votes, self._possible(), unsure)
+            self.observed_[unsure] = self.code_rows_.known()[unsure]
 
     def _blend_codes(self, codes: CSRRows, view: View) -> np.ndarray:
         background = codes.has_column(0)
@@ -390,8 +390,7 @@ class Learner(ABC):
 
     def _possible(self) -> np.ndarray:
         """Mark the ids that are classes, (K,) bool: those that views name; all, where one of them has no names."""
-        possible = np.zeros(self.num_classes, bool)
-        names = {id(view.class_names): view.class_names for view in self.views.values()}
-        for ids in names.values() or (None,):
-            possible[[k for k in ids if k < self.num_classes] if ids is not None else slice(None)] = True
-        return possible
+        names = {id(view.class_names): view.class_names for view in self.views.values()}.values()
+        if not names or None in names:
+            return np.ones(self.num_classes, bool)
+        return np.isin(np.arange(self.num_classes), [k for ids in names if ids is not None for k in ids])
