@@ -18,14 +18,12 @@ from gsseg_core.data.view import View
 from gsseg_core.demo.mask_errors import resize
 from gsseg_core.errors import SettingsError
 from gsseg_core.learn.em import boundary_alignment
-from gsseg_core.learn.em.block_weights import near_boundaries
 from gsseg_core.learn.em.boundary_alignment import _boundary_strengths, _nearest_regions, align_boundaries, reach
 from gsseg_core.learn.em.em_learner import EMLearner, EMSettings
 from gsseg_core.learn.em.mask_offset import move_mask
 from gsseg_core.learn.em.rejected_regions import connected_pixels
 from gsseg_core.learn.em.scene_edges import scene_edges
 from gsseg_core.raster.backends import make_operator
-from gsseg_core.raster.constants import BLOCK
 from gsseg_core.scene.gaussian_scene import GaussianScene
 
 SCENE, _ = balls_on_a_table()
@@ -186,8 +184,8 @@ def test_edges_are_summed_by_pair_and_ring_as_by_looking_at_all_pixels() -> None
 
 def test_edges_of_a_scene_lie_along_its_objects() -> None:
     view = clean_views(1)[0]
-    edges = scene_edges(make_operator(SCENE, view.camera), SCENE)
     labels = view.read_labels()
+    edges = scene_edges(make_operator(SCENE, view.camera), SCENE, labels, max(labels.shape))
     outline = ndimage.morphological_gradient(labels, size=3) > 0
     assert edges.shape == labels.shape and edges.dtype == np.float32 and edges.min() >= 0
     assert edges[outline].mean() > 2 * edges[~ndimage.binary_dilation(outline, iterations=2)].mean()
@@ -195,7 +193,8 @@ def test_edges_of_a_scene_lie_along_its_objects() -> None:
 
 def test_a_scene_without_colour_has_no_edges() -> None:
     grey = GaussianScene.from_arrays(SCENE.means, SCENE.quats, SCENE.scales, SCENE.opacities, np.zeros_like(SCENE.sh))
-    assert not scene_edges(make_operator(grey, clean_views(1)[0].camera), grey).any()
+    view = clean_views(1)[0]
+    assert not scene_edges(make_operator(grey, view.camera), grey, view.read_labels(), 9).any()
 
 
 def test_em_learns_more_from_masks_that_are_off_since_it_moves_them() -> None:
@@ -241,9 +240,6 @@ def test_edges_near_boundaries_are_all_that_moving_them_takes(seed: int) -> None
     for label in range(1, 4):
         y, x = rng.integers(0, 400, 2)
         labels[y : y + 30, x : x + 25] = label
-    edges = scene_edges(operator, SCENE)
-    near = near_boundaries(labels, -(-(reach(3) + 1) // BLOCK))
-    assert not near.all()
-    some = scene_edges(operator, SCENE, near)
+    edges, some = (scene_edges(operator, SCENE, labels, distance) for distance in (max(labels.shape), reach(3) + 1))
     assert (some != edges).any()
     np.testing.assert_array_equal(align_boundaries(labels, some, 3), align_boundaries(labels, edges, 3))

@@ -242,16 +242,16 @@ def test_it_stops_by_itself(views: list[View]) -> None:
     assert not taught(EMLearner(SCENE, NUM_CLASSES, EMSettings(max_steps=steps - 1)), views).fit().converged_
 
 
-def first_models(learner: EMLearner, votes: CSRRows, rejected: dict[str, np.ndarray]) -> dict[str, ErrorModel]:
-    """Error models by the votes of the other views, without those for labels that are rejected, (L,) bool by view."""
-    known = {name: rejected.get(name) for name in learner.views}
-    return learner._initial_error_models(votes, known, lambda: None)[1]
+def first_models(learner: EMLearner, votes: CSRRows, rejects: bool = True) -> dict[str, ErrorModel]:
+    """Error models by the votes of the other views, without those for labels that are rejected."""
+    rejected = learner._reject_regions(votes, lambda: None)[1] if rejects else dict.fromkeys(learner.views)
+    return learner._initial_error_models(votes, rejected, lambda: None)[1]
 
 
 def test_no_step_gains_more_than_its_slope_promises() -> None:
     learner = taught(EMLearner(SCENE, NUM_CLASSES), wrong_views(4))
     votes = learner._votes.rows()
-    models = first_models(learner, votes, {})
+    models = first_models(learner, votes, rejects=False)
     codes, prior = votes.with_data(votes.data.astype(np.float32)).normalised(), np.full(len(votes.data), 0.1)
 
     def look() -> tuple[np.ndarray, float]:
@@ -327,7 +327,7 @@ def test_sums_over_views_do_not_depend_on_order_or_grouping(groups: list[int], o
     learner = taught(EMLearner(SCENE, NUM_CLASSES), [with_clutter(view) for view in wrong_views(6)])
     codes, names = CSRRows.from_dense(learner.vote_codes() + np.float32(0.01)), list(learner.views)
     votes = learner._votes.rows()
-    models = first_models(learner, votes, learner._reject_regions(votes, lambda: None)[1])
+    models = first_models(learner, votes)
     whole, counted = learner._e_step(codes, deepcopy(models), lambda: None)
     parts = np.zeros_like(whole)
     for group in set(groups):
@@ -343,7 +343,7 @@ def test_codes_without_a_view_are_a_step_with_the_gains_of_all_the_others() -> N
     codes = CSRRows.from_dense(learner.vote_codes() + np.float32(0.01))
     prior = np.random.default_rng(0).uniform(0, 3, len(codes.data)).astype(np.float32)
     votes = learner._votes.rows()
-    models = first_models(learner, votes, learner._reject_regions(votes, lambda: None)[1])
+    models = first_models(learner, votes)
     gradient, _ = learner._e_step(codes, models, lambda: None)
     for name in learner.views:
         observation = learner.observation(name)

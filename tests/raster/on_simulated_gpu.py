@@ -277,7 +277,7 @@ def test_edges_of_the_scene_are_those_of_the_cpu(grey: bool) -> None:
     colors = np.zeros_like(SCENE.sh) if grey else RNG.random(SCENE.sh.shape, np.float32)
     scene = GaussianScene.from_arrays(SCENE.means, SCENE.quats, SCENE.scales, SCENE.opacities, colors)
     ours, theirs = (
-        kernels.edges_along(make_operator(scene, CAMERA, device), scene, MASK, max(HEIGHT, WIDTH))
+        kernels.scene_edges(make_operator(scene, CAMERA, device), scene, MASK, max(HEIGHT, WIDTH))
         for kernels, device in ((em_kernels, "cpu"), (em_gpu_kernels, "cuda"))
     )
     assert ours.any() != grey
@@ -310,7 +310,7 @@ def step() -> dict[str, dict[str, np.ndarray]]:
             kernels.put(all_votes, "cuda"),
         )
         said = kernels.pair_likelihood(here, pairs, by_class)
-        shares = kernels.shares(seen, said, by_class[:, 0]).pairs
+        shares = kernels.shares(seen, here, pairs, by_class).pairs
         added = here.with_data(kernels.zeros(here, np.int64))
         kernels.accumulate(added, pairs, by_class, shares)
         stepped = kernels.rows_like(here, pairs.ids)

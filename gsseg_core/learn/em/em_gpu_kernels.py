@@ -14,7 +14,7 @@ import torch
 from gsseg_core.csr_rows import CSRRows
 from gsseg_core.data.label_evidence import UNITS, LabelEvidence
 from gsseg_core.learn.em.em_kernels import GRADIENT_UNIT, MAX_TERM
-from gsseg_core.learn.em.gpu_edges import edges_along as edges_along
+from gsseg_core.learn.em.gpu_edges import scene_edges as scene_edges
 from gsseg_core.raster.gpu.device import called_by_kernels, cuda, find_gpu, gpu_kernel, launch, on_device, to_cpu
 from gsseg_core.raster.gpu.gpu_observation import GPUObservation, ShareTensors
 from gsseg_core.raster.gpu.label_sharing import halves, joined
@@ -69,10 +69,10 @@ def rows_like(rows: RowTensors, ids: torch.Tensor) -> RowTensors:  # (M,)
     return RowTensors(indptr, rows.indices.new_empty(total), rows.data.new_empty(total))
 
 
-def shares(observation: Observation, likelihood: torch.Tensor, rest: np.ndarray) -> ShareTensors:
-    """Share one vote per labelled pixel, as `Observation.shares` does."""
+def shares(observation: Observation, codes: RowTensors, pairs: PairTensors, likelihood: np.ndarray) -> ShareTensors:
+    """Share one vote per labelled pixel among its pairs by class probabilities, as `Observation.shares` does."""
     assert isinstance(observation, GPUObservation)
-    return observation.shared(likelihood, rest)
+    return observation.shared(pair_likelihood(codes, pairs, likelihood), likelihood[:, 0])
 
 
 def pair_likelihood(codes: RowTensors, pairs: PairTensors, likelihood: np.ndarray) -> torch.Tensor:

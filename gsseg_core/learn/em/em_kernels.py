@@ -18,7 +18,7 @@ from numba.core import types
 from gsseg_core.csr_rows import CSRRows
 from gsseg_core.data.label_evidence import UNITS, LabelEvidence, vote_units
 from gsseg_core.kernels.compiler import called_by_kernels, kernel
-from gsseg_core.learn.em.scene_edges import edges_along as edges_along
+from gsseg_core.learn.em.scene_edges import scene_edges as scene_edges
 from gsseg_core.learn.vote_resolution import resolve_row
 from gsseg_core.raster.observation import Observation, ViewPairs, VoteShares
 from gsseg_core.simd import intrinsic
@@ -73,9 +73,9 @@ def zeros(rows: CSRRows, kind: type[np.generic]) -> np.ndarray:
     return np.zeros(len(rows.data), kind)
 
 
-def shares(observation: Observation, likelihood: np.ndarray, rest: np.ndarray) -> VoteShares:
-    """Share one vote per labelled pixel, as `Observation.shares` says."""
-    return observation.shares(likelihood, rest)
+def shares(observation: Observation, codes: CSRRows, pairs: ViewPairs, likelihood: np.ndarray) -> VoteShares:
+    """Share one vote per labelled pixel among its pairs by class probabilities, as `Observation.shares` says."""
+    return observation.shares(pair_likelihood(codes, pairs, likelihood), likelihood[:, 0])
 
 
 @intrinsic

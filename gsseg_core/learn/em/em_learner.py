@@ -175,36 +175,29 @@ class EMLearner(Learner):
         self._require_views()
         tick = partial(progress, "em", 0, settings.max_steps)
         votes, rejected = self._reject_regions(self._votes.rows(), tick)
-        resolved = resolved_votes(votes, self._possible())
-        any_against, evidence = votes.data.min(initial=0) < 0, VOTE_UNIT * resolved.sums()
-        self.observed_ = evidence > 0
-        resolved, prior = resolved.united(self._spatial_prior(resolved, evidence))
-        # The votes are the first step; with the prior added, J is finite from the start. What is zero now stays zero
-        # in every step, so that rows keep their classes, unless the prior is taken anew.
-        codes = resolved.with_data(resolved.data.astype(np.float32) * np.float32(VOTE_UNIT) + prior.data).normalised()
-        self.history_ = history = list[float]()
-        known = {name: rejected.get(name) for name in self.views}
-        _, estimated = self._over_views(EMLearner._initial_error_models, known, tick, votes)
-        models: dict[str, ErrorModel] = {name: estimated[name] for name in known}
+        codes, prior, evidence = self._initialize_codes(votes)
+        _, estimated = self._over_views(EMLearner._initial_error_models, rejected, tick, votes)
+        models: dict[str, ErrorModel] = {name: estimated[name] for name in self.views}
         pixels = sum(model.num_pixels for model in models.values())
         named = sum(model.named_pixels for model in models.values())
-        self.rounds_ = rounds = [0]
-        while len(history) < settings.max_steps:
-            tick = partial(progress, "em", len(history), settings.max_steps)
+        self.observed_, self.history_, self.rounds_ = evidence > 0, [], [0]
+        for step in range(settings.max_steps):
+            tick = partial(progress, "em", step, settings.max_steps)
             gradient, log_likelihoods = self._over_views(EMLearner._e_step, models, tick, codes)
-            history.append(self._lower_bound(codes, prior, log_likelihoods) / pixels)
-            rounds[-1] += 1
-            last_round = len(rounds) > settings.refits or not settings.errors
+            self.history_.append(self._compute_lower_bound(codes, prior, log_likelihoods) / pixels)
+            self.rounds_[-1] += 1
+            last_round = len(self.rounds_) > settings.refits or not settings.errors
             tolerance = settings.tolerance * (1 if last_round else REFIT_FACTOR) * named**2 / pixels
-            small = kernels.predicted_gain(codes, gradient, prior.data) < tolerance
-            self.converged_ = small and last_round
-            if self.converged_ or len(history) == settings.max_steps:
+            gains_little = kernels.predicted_gain(codes, gradient, prior.data) < tolerance
+            self.converged_ = gains_little and last_round
+            if self.converged_ or step + 1 == settings.max_steps:
                 before, backend = rows_on(codes.with_data(codes.data.copy()), self.device)
                 self._last_step_ = before, backend.put(gradient, self.device), codes.has_column(0)
-            elif small:
+            elif gains_little:
                 models |= self._over_views(EMLearner._refit_error_models, models, tick, codes, gradient, prior.data)[1]
-                rounds.append(0)
-                if any_against:  # Such votes say little of what the neighbours are; the probabilities know by now.
+                self.rounds_.append(0)
+                if votes.data.min(initial=0) < 0:
+                    # Such votes say little of what the neighbours are; the probabilities know by now.
                     codes, gradient, prior = with_prior(codes, gradient, self._spatial_prior(codes, evidence))
             kernels.m_step(codes, gradient, prior.data)
             if self.converged_:
@@ -214,7 +207,17 @@ class EMLearner(Learner):
         self._finish()
         return self
 
-    def _lower_bound(self, codes: CSRRows, prior: CSRRows, log_likelihoods: Mapping[str, float]) -> float:
+    def _initialize_codes(self, votes: CSRRows) -> tuple[CSRRows, CSRRows, np.ndarray]:
+        """Take a first step by the votes: class probabilities, their prior, and of how many px they are, (N,)."""
+        resolved = resolved_votes(votes, self._possible())
+        evidence = VOTE_UNIT * resolved.sums()
+        resolved, prior = resolved.united(self._spatial_prior(resolved, evidence))
+        # With the prior added, J is finite from the start. What is zero now stays zero in every step, so that rows keep
+        # their classes, unless the prior is taken anew.
+        codes = resolved.with_data(resolved.data.astype(np.float32) * np.float32(VOTE_UNIT) + prior.data).normalised()
+        return codes, prior, evidence
+
+    def _compute_lower_bound(self, codes: CSRRows, prior: CSRRows, log_likelihoods: Mapping[str, float]) -> float:
         """J, in nats: the log-likelihood of all labels, and the log of the prior but for a constant."""
         counted = prior.data > 0
         log_prior = (prior.data[counted] * np.log(codes.data[counted])).sum(dtype=np.float64)
@@ -277,25 +280,26 @@ class EMLearner(Learner):
         seen = seen.hardened() if settings.errors else seen  # Errors are of whole regions, probabilities of pixels.
         if settings.errors and settings.edge_px and seen.evidence is None:
             distance = reach(settings.edge_px) + 1  # One px more, since edges are differences.
-            edges = kernels_on(self.device).edges_along(operator, self.scene, seen.labels, distance)
+            edges = kernels_on(self.device).scene_edges(operator, self.scene, seen.labels, distance)
             seen = SeenLabels(align_boundaries(seen.labels, edges, settings.edge_px))
         return split_regions(seen) if settings.rejects_regions else seen
 
-    def _reject_regions(self, votes: CSRRows, tick: Tick) -> tuple[CSRRows, dict[str, np.ndarray]]:
-        """Reject labels that the other views contradict; return the votes without them, and by view which they are.
+    def _reject_regions(self, votes: CSRRows, tick: Tick) -> tuple[CSRRows, dict[str, np.ndarray | None]]:
+        """Reject labels that the other views contradict: the votes without them; by view which they are, (L,) bool.
 
         What is rejected must not speak against others: so each is tested once more, by the votes that are left.
         """
+        rejected: dict[str, np.ndarray | None] = dict.fromkeys(self.views)  # None where none is
         if not self.settings.rejects_regions:
-            return votes, {}
+            return votes, rejected
         # All neighbours of a scene are found once; while a GPU tests regions, the CPU is free for that.
         search, find = partial(find_neighbours, self.scene, self.settings.prior_k), EMLearner._find_rejected
         with meanwhile(search, self.device) if self.settings.prior_weight else nullcontext():
-            rejected_votes, rejected = self._over_views(find, dict.fromkeys(self.views), tick, votes)
-            if rejected:
-                left = votes.with_data(votes.data - rejected_votes)
-                rejected_votes, rejected = self._over_views(find, rejected, tick, left)
-        return votes.with_data(votes.data - rejected_votes).nonzero(), rejected
+            change, doubted = self._over_views(find, rejected, tick, votes)
+            if doubted:
+                left = votes.with_data(votes.data + change)
+                change, doubted = self._over_views(find, doubted, tick, left)
+        return votes.with_data(votes.data + change).nonzero(), rejected | doubted
 
     def _over_views(
         self, work: Callable[..., OverViews], by_view: Mapping[str, Any], tick: Tick, *arrays: CSRRows | np.ndarray
@@ -309,12 +313,12 @@ class EMLearner(Learner):
         """Find the labels of some views that the other views contradict, by the votes of all, int64.
 
         Of a view that is None among the `doubted`, all labels are tested; else those marked, (L,) bool, whose votes are
-        not among the votes. Returns the votes of those that are found, (Z,) int64 for each entry of the votes, and
-        which they are, (L,) bool by view; views without any are left out.
+        not among the votes. Returns what is left of zero votes, (Z,) int64 for each entry of the votes, when those that
+        are found are taken from it, and which they are, (L,) bool by view; views without any are left out.
         """
         possible, device = self._possible(), self._device_of(votes)
         votes, backend = rows_on(votes, device)
-        minus, rejected, least = backend.zeros(votes, np.int64), {}, self.settings.least_agreement
+        change, rejected, least = backend.zeros(votes, np.int64), {}, self.settings.least_agreement
 
         def find(name: str, observation: Observation) -> tuple[np.ndarray, Observation]:
             return find_rejected(votes, observation, possible, least, device, doubted[name]), observation
@@ -323,8 +327,8 @@ class EMLearner(Learner):
             if labels.any():
                 rejected[name] = labels
                 rejected_votes = observation.evidence.without_names(~labels).votes
-                backend.subtract_votes(votes.with_data(minus), observation, rejected_votes)
-        return -backend.returned(minus), rejected
+                backend.subtract_votes(votes.with_data(change), observation, rejected_votes)
+        return backend.returned(change), rejected
 
     def _device_of(self, votes: CSRRows) -> str:
         """Device that counts votes: those against a class are resolved on the CPU alone."""
@@ -361,8 +365,7 @@ class EMLearner(Learner):
 
         def share(name: str, observation: Observation) -> tuple[ViewPairs, np.ndarray, VoteShares]:
             (likelihood, used), pairs = models[name].by_label, backend.pairs_of(observation)
-            of_pairs = backend.pair_likelihood(codes, pairs, likelihood)
-            return pairs, used, backend.shares(observation, of_pairs, likelihood[:, 0])
+            return pairs, used, backend.shares(observation, codes, pairs, likelihood)
 
         gradient, log_likelihoods = backend.zeros(codes, np.int64), {}
         for name, (pairs, used, shares) in self._of_each(share, models, tick):
@@ -381,8 +384,7 @@ class EMLearner(Learner):
             model, pairs = models[name], backend.pairs_of(observation)
             without = codes_without(observation, model, codes, gradient, prior, self.device)
             likelihood, _ = model.by_label
-            of_pairs = backend.pair_likelihood(without, backend.by_row(pairs), likelihood)
-            shares = backend.shares(observation, of_pairs, likelihood[:, 0])
+            shares = backend.shares(observation, without, backend.by_row(pairs), likelihood)
             counts = backend.confusion_counts(without, pairs, shares.pairs, self.num_classes, len(likelihood))
             counts[0] += shares.rest
             # Only some pixels of each label were gone through: they count for all of them.

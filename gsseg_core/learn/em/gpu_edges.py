@@ -16,7 +16,7 @@ from gsseg_core.scene.scene_cache import PerScene
 _LIGHT: PerScene[torch.Tensor] = PerScene()
 
 
-def edges_along(operator: ViewOperator, scene: GaussianScene, labels: np.ndarray, distance: int) -> np.ndarray:
+def scene_edges(operator: ViewOperator, scene: GaussianScene, labels: np.ndarray, distance: int) -> np.ndarray:
     """Strength of the edges of a view, (H, W) float32: all of them, whatever the boundaries of its mask."""
     del labels, distance
     assert isinstance(operator, GPUOperator)

@@ -35,7 +35,7 @@ def codes_without(
     """
     backend = kernels_on(device)
     (likelihood, used), pairs = model.by_label, backend.pairs_of(observation)
-    shares = backend.shares(observation, backend.pair_likelihood(codes, pairs, likelihood), likelihood[:, 0])
+    shares = backend.shares(observation, codes, pairs, likelihood)
     stepped: CSRRows = backend.rows_like(codes, pairs.ids)
     backend.m_step_without_view(codes, gradient, prior, pairs, used, shares.pairs, stepped)
     return stepped

@@ -36,23 +36,17 @@ def luminance(scene: GaussianScene) -> tuple[np.ndarray, bool]:
     return _LIGHT.of(scene, measured)
 
 
-def edges_along(operator: ViewOperator, scene: GaussianScene, labels: np.ndarray, distance: int) -> np.ndarray:
-    """Find `scene_edges` within so many px of the boundaries of a mask, (H, W) int32, and in the sample."""
-    return scene_edges(operator, scene, near_boundaries(labels, -(-distance // BLOCK)))
-
-
-def scene_edges(operator: ViewOperator, scene: GaussianScene, near: np.ndarray | None = None) -> np.ndarray:
+def scene_edges(operator: ViewOperator, scene: GaussianScene, labels: np.ndarray, distance: int) -> np.ndarray:
     """Strength of the edges of colour and depth of a view, (H, W) float32, at least 0; see above for units.
 
-    If only those `near` something are wanted, (ceil(H / 4), ceil(W / 4)) bool by blocks, what has no such block around
-    it, and is not in the sample, has no meaning.
+    It has no meaning farther than so many px from the boundaries of the view's mask, (H, W) int32, but in the sample.
     """
     camera, (light, differs) = operator.camera, luminance(scene)
     if not differs:
         return np.zeros((camera.height, camera.width), np.float32)
     ahead = camera.world_to_camera[2].astype(np.float32)
     channels = _luminance_and_inverse_depth(scene.means, light, operator.ids, ahead)
-    wanted = None if near is None else _near_or_sampled(near, camera.height, camera.width)
+    wanted = _near_or_sampled(near_boundaries(labels, -(-distance // BLOCK)), camera.height, camera.width)
     light_edges, depth_edges = _differences(*operator.blend_seen(channels, wanted))
     return _in_units(light_edges) + _in_units(depth_edges)
 
