@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 import torch
@@ -109,11 +108,11 @@ class GradientLearner(Learner):
             order = [names[i] for i in rng.permutation(len(names))]
             for done, name in enumerate(order):
                 progress("gradient", epoch * len(names) + done, steps)
-                observation = self.observation(name)
-                loss = cross_entropy(torch.softmax(codes, dim=1), observation)
-                adam.step(*torch.autograd.grad(loss, codes), rate)
+                probabilities = torch.softmax(codes, dim=1)
+                loss, gradient = cross_entropy(probabilities.detach().numpy(), self.observation(name))
+                adam.step(*torch.autograd.grad(probabilities, codes, torch.from_numpy(gradient)), rate)
                 rate *= decay
-                losses.append(float(loss.detach()))
+                losses.append(float(loss))
             history.append(float(np.mean(losses)))
         progress("gradient", steps, steps)
         learnt: np.ndarray = torch.softmax(codes, dim=1).detach().numpy()
@@ -139,36 +138,19 @@ class _Adam:
         self._codes.addcdiv_(self._mean, scale, value=-(rate / (1 - 0.9**self._steps)))
 
 
-def cross_entropy(probabilities: torch.Tensor, observation: Observation) -> torch.Tensor:
-    """CES of one view (eq. 3 and 4 of the paper), differentiable with respect to the probabilities (N, K)."""
-    loss: torch.Tensor = _CrossEntropy.apply(probabilities, observation)  # type: ignore[no-untyped-call]
-    return loss
+def cross_entropy(probabilities: np.ndarray, observation: Observation) -> tuple[np.float32, np.ndarray]:  # (N, K)
+    """CES of one view (eq. 3 and 4 of the paper), and its gradient W^T dL/dO by the probabilities, (N, K) float32.
 
-
-class _CrossEntropy(torch.autograd.Function):
-    """The loss touches, in each pixel, only the class seen there; so do its value and its gradient, W^T dL/dO."""
-
-    @staticmethod
-    def forward(ctx: Any, probabilities: torch.Tensor, observation: Observation) -> torch.Tensor:
-        codes, scale = probabilities.detach().numpy(), 1.0 / (observation.num_pixels * probabilities.shape[1])
-        ctx.shape, ctx.observation = probabilities.shape, observation
-        if observation.evidence.mass is None:
-            where = observation.ids[observation.rows], observation.classes[observation.labels]
-            likelihood, rest = codes[where], (observation.classes == 0).astype(np.float32)
-        else:
-            plausible = observation.evidence.plausibility(codes.shape[1])
-            likelihood = (codes[observation.ids] @ plausible.T)[observation.rows, observation.labels]
-            rest = plausible[:, 0]
-        shares = observation.shares(likelihood, rest)
-        ctx.gradient = -scale * shares.pairs
-        return torch.tensor(-scale * shares.log_likelihood, dtype=probabilities.dtype)
-
-    @staticmethod
-    def backward(ctx: Any, upstream: torch.Tensor) -> tuple[torch.Tensor, None]:
-        gradient, observation = np.zeros(ctx.shape, np.float32), ctx.observation
-        if observation.evidence.mass is None:
-            gradient[observation.ids[observation.rows], observation.classes[observation.labels]] = ctx.gradient
-        else:
-            plausible = observation.evidence.plausibility(ctx.shape[1])
-            gradient[observation.ids] = observation.dense(ctx.gradient) @ plausible
-        return upstream * torch.from_numpy(gradient), None
+    In each pixel, the loss touches only the class seen there, and so does its gradient.
+    """
+    gradient, scale = np.zeros_like(probabilities), 1.0 / (observation.num_pixels * probabilities.shape[1])
+    if observation.evidence.mass is None:
+        where = observation.ids[observation.rows], observation.classes[observation.labels]
+        shares = observation.shares(probabilities[where], (observation.classes == 0).astype(np.float32))
+        gradient[where] = -scale * shares.pairs
+    else:
+        plausible = observation.evidence.plausibility(probabilities.shape[1])
+        likelihood = (probabilities[observation.ids] @ plausible.T)[observation.rows, observation.labels]
+        shares = observation.shares(likelihood, plausible[:, 0])
+        gradient[observation.ids] = observation.dense(-scale * shares.pairs) @ plausible
+    return np.float32(-scale * shares.log_likelihood), gradient

@@ -25,38 +25,35 @@ def partly_known() -> View:
     return View.from_arrays(VIEWS[0].camera, labels)
 
 
-def random_codes(seed: int = 0) -> torch.Tensor:
+def random_codes(seed: int = 0) -> np.ndarray:
     rng = np.random.default_rng(seed)
-    return torch.from_numpy(rng.dirichlet(np.ones(NUM_CLASSES), len(SCENE)).astype(np.float32))
+    return rng.dirichlet(np.ones(NUM_CLASSES), len(SCENE)).astype(np.float32)
 
 
 def test_the_loss_is_the_formula_of_the_paper_over_the_labelled_pixels() -> None:
     view, codes = partly_known(), random_codes()
     operator, labels = make_operator(SCENE, view.camera), view.read_labels()
     weights, left_over = lifting(operator, SCENE)
-    image = (weights @ codes.numpy()).reshape(*labels.shape, NUM_CLASSES)
+    image = (weights @ codes).reshape(*labels.shape, NUM_CLASSES)
     image[..., 0] += left_over.reshape(labels.shape)
     known = labels >= 0
     losses = [-np.log(image[..., k][labels == k]).sum() / known.sum() for k in range(NUM_CLASSES)]
-    loss = cross_entropy(codes, operator.observe(labels))
+    loss, _ = cross_entropy(codes, operator.observe(labels))
     assert float(loss) == pytest.approx(np.mean(losses), rel=1e-5)
 
 
 def test_the_gradient_is_that_of_finite_differences() -> None:
     view, codes = partly_known(), random_codes()
     observation = make_operator(SCENE, view.camera).observe(view.read_labels())
-    codes.requires_grad_(True)
-    (3 * cross_entropy(codes, observation)).backward()
-    assert codes.grad is not None
+    _, gradient = cross_entropy(codes, observation)
     for seed in range(5):
-        direction = torch.from_numpy(np.random.default_rng(seed).normal(size=codes.shape).astype(np.float32))
-        step = 2e-3 * direction * codes.detach()
-        with torch.no_grad():
-            rise = cross_entropy(codes + step, observation) - cross_entropy(codes - step, observation)
-        expected = float((codes.grad.double() * step).sum()) * 2 / 3
+        direction = np.random.default_rng(seed).normal(size=codes.shape).astype(np.float32)
+        step = np.float32(2e-3) * direction * codes
+        rise = cross_entropy(codes + step, observation)[0] - cross_entropy(codes - step, observation)[0]
+        expected = float((gradient.astype(np.float64) * step).sum()) * 2
         assert float(rise) == pytest.approx(expected, rel=0.02, abs=2e-6)
     unseen = np.setdiff1d(np.arange(len(SCENE)), observation.ids)
-    assert not codes.grad[unseen].any()
+    assert not gradient[unseen].any()
 
 
 def test_steps_are_those_of_adam() -> None:
