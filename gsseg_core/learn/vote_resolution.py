@@ -12,7 +12,6 @@ from gsseg_core.csr_rows import CSRRows
 from gsseg_core.kernels.compiler import called_by_kernels, kernel
 
 ROUNDS = 50  # of estimating how frequent classes are
-_VOTED, _UNSURE = -1, -2  # in place of the only class left, see `_count_shares`
 
 
 def resolved_votes(votes: CSRRows, possible: np.ndarray) -> CSRRows:  # int64; (K,) bool, ids that are classes
@@ -36,10 +35,10 @@ def vote_shares(votes: CSRRows, possible: np.ndarray) -> CSRRows:  # int64; (K,)
     Where all votes are against classes, the one class without any is certain; where several of the possible have none,
     they share as `impute_probabilities` says.
     """
-    counts, only = _count_shares(votes, possible)
+    counts, only = _count_shares(votes, np.flatnonzero(possible))
     shares = CSRRows.room_for(counts, np.float32)
     _share(votes, only, shares)
-    unsure = np.flatnonzero(only == _UNSURE)
+    unsure = np.flatnonzero((counts == 0) & (np.diff(votes.indptr) > 0))
     return impute_probabilities(shares, votes, possible, unsure) if len(unsure) else shares
 
 
@@ -115,40 +114,42 @@ def weigh_votes(votes: CSRRows) -> tuple[np.ndarray, np.ndarray]:
 
 def is_resolved(votes: CSRRows, possible: np.ndarray) -> np.ndarray:  # int64; (K,) bool, ids that are classes
     """Tell which Gaussians have a vote for a class, or only one class left, (N,) bool."""
-    counts, _ = _count_shares(votes, possible)
+    counts, _ = _count_shares(votes, np.flatnonzero(possible))
     return np.asarray(counts > 0)
 
 
 @kernel(parallel=True)
-def _count_shares(votes: CSRRows, possible: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def _count_shares(votes: CSRRows, ids: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Count the classes of each Gaussian that have a share in its probabilities, (N,) int64.
 
-    Second comes, (N,) int32: the only class left where all votes are against classes; `_UNSURE` where there are more of
-    those, or none; else `_VOTED`.
+    Second comes the only class left of all, `ids`, where the votes are against all others, (N,) int32; else -1.
     """
     indptr, classes, data = votes
     counts, only = np.zeros(indptr.shape[0] - 1, np.int64), np.empty(indptr.shape[0] - 1, np.int32)
     for i in nb.prange(indptr.shape[0] - 1):
-        only[i] = _VOTED
+        only[i] = -1
         for z in range(indptr[i], indptr[i + 1]):
             counts[i] += data[z] > 0
         if counts[i] == 0 and indptr[i] < indptr[i + 1]:
-            only[i] = _only_possible(classes[indptr[i] : indptr[i + 1]], possible)
+            row = slice(indptr[i], indptr[i + 1])
+            only[i] = _only_class_left(classes[row], data[row], ids)
             counts[i] = only[i] >= 0
     return counts, only
 
 
 @called_by_kernels
-def _only_possible(classes: np.ndarray, possible: np.ndarray) -> int:
-    """Return the one possible class that is not among these, ascending; `_UNSURE` if there are more, or none."""
-    found, z = _UNSURE, 0
-    for k in range(possible.shape[0]):
-        if z < classes.shape[0] and classes[z] == k:
+def _only_class_left(classes: np.ndarray, votes: np.ndarray, ids: np.ndarray) -> int:
+    """Return the one of all classes `ids` that a row has no votes for or against; -1 if there are more, or none."""
+    found, z = -1, 0
+    for place in range(ids.shape[0]):
+        while z < classes.shape[0] and (classes[z] < ids[place] or votes[z] == 0):
             z += 1
-        elif possible[k]:
-            if found >= 0:
-                return _UNSURE
-            found = k
+        if z < classes.shape[0] and classes[z] == ids[place]:
+            z += 1
+        elif found >= 0:
+            return -1
+        else:
+            found = ids[place]
     return found
 
 
@@ -169,20 +170,6 @@ def _share(votes: CSRRows, only: np.ndarray, shares: CSRRows) -> None:
 
 
 @called_by_kernels
-def _only_class_left(classes: np.ndarray, votes: np.ndarray, ids: np.ndarray) -> tuple[int, int]:
-    """Return the one of all classes `ids` without votes where the others of a row have some, any against; else -1."""
-    voted, least, against, place = 0, 2**63 - 1, False, 0
-    for z in range(votes.shape[0]):
-        if votes[z] != 0:
-            voted += 1
-            least = min(least, abs(votes[z]))
-            against |= votes[z] < 0
-            # Both ascend, so the first id that is not there is the one that is missing.
-            place += place < ids.shape[0] and ids[place] == classes[z]
-    return (ids[place] if against and voted == ids.shape[0] - 1 else -1), least
-
-
-@called_by_kernels
 def resolve_row(
     classes: np.ndarray,  # (n,) of one row
     votes: np.ndarray,  # (n,) int64, of it
@@ -191,8 +178,12 @@ def resolve_row(
     kept_votes: np.ndarray,  # out, likewise
 ) -> int:
     """Resolve the votes of one row as `resolved_votes` does; return the number of entries written."""
-    free, least = _only_class_left(classes, votes, ids)
-    n = 0
+    least, against, n = 2**63 - 1, False, 0
+    for z in range(votes.shape[0]):
+        if votes[z] != 0:
+            least = min(least, abs(votes[z]))
+            against |= votes[z] < 0
+    free = _only_class_left(classes, votes, ids) if against else -1
     for z in range(votes.shape[0]):
         if 0 <= free < classes[z]:
             kept_classes[n], kept_votes[n] = free, least
