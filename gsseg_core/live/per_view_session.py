@@ -18,7 +18,7 @@ from gsseg_core.errors import SettingsError
 from gsseg_core.learn.all_or_nothing import all_or_nothing
 from gsseg_core.learn.learner_state import Learnt
 from gsseg_core.learn.vote_learner import VoteLearner
-from gsseg_core.live.results import Outcome, Rejection
+from gsseg_core.live.results import Outcome
 from gsseg_core.live.session import LiveSession
 from gsseg_core.objects.object_table import ObjectTable, Repair, object_name
 from gsseg_core.raster.backends import make_operator
@@ -54,16 +54,13 @@ class PerViewSession(LiveSession):
         """Names by number, "object_001" and so on."""
         return {k: object_name(k) for k in range(self._live.num_classes)}
 
-    def _fuse(self, view: View, operator: ViewOperator | None = None) -> Rejection | None:
+    def _fuse(self, view: View, operator: ViewOperator | None = None) -> None:
         # The table looks at the mask again, and names of classes say nothing of its ids.
-        view, undo = replace(view, class_names=None).held(), self._table.checkpoint()
+        view = replace(view, class_names=None).held()
         if view.has_mask:  # Made once: its segments are lifted, and then the objects that they are.
             operator = operator or make_operator(self.scene, view.camera, self.device)
-        with all_or_nothing(undo):
-            rejection = super()._fuse(self._table.match(view, operator), operator)
-        if rejection is not None:
-            undo()
-        return rejection
+        with all_or_nothing(self._table.checkpoint()):
+            super()._fuse(self._table.match(view, operator), operator)
 
     def move_view(self, name: str, moved: Callable[[Camera], Camera], era: object) -> bool:
         """Have a view seen from another camera, as a `LivingSession` does; its ids are matched to the objects anew."""

@@ -7,6 +7,7 @@ import threading
 from collections import Counter
 from collections.abc import Callable, Mapping
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from weakref import WeakKeyDictionary
 
@@ -17,8 +18,10 @@ from gsseg_core.data.class_names import class_name
 from gsseg_core.data.dataset import Dataset
 from gsseg_core.data.view import View, spread
 from gsseg_core.errors import GssegError, NoCodesError, NoUsableViewsError, SettingsError, StateFileError
+from gsseg_core.learn.all_or_nothing import all_or_nothing
 from gsseg_core.learn.learner_state import OBJECTS_OF_ONE_SESSION, Learnt, State
 from gsseg_core.learn.registry import make_learner
+from gsseg_core.learn.usable_views import UnusableViewError
 from gsseg_core.learn.vote_learner import VoteLearner
 from gsseg_core.live.current_codes import current_codes, current_evidence
 from gsseg_core.live.living_votes import without_groups
@@ -148,28 +151,25 @@ class LiveSession:
         with self._lock:
             if era is not None and era is not self._era:
                 return Rejection(SCENE_CHANGED, f"view '{view.name}': it came before all that was known was forgotten")
-            num_classes = self._live.num_classes
             try:
-                rejection = self._fuse(view)
+                # With a view that is not used no classes come; and after too little memory, all is still of use.
+                with all_or_nothing(partial(self._live.resize, self._live.num_classes)):
+                    self._fuse(view)
+            except UnusableViewError as why:
+                return self.reject(Rejection(str(why).replace(" ", "_"), f"view '{view.name}': {why}"))
             except GssegError as error:
-                rejection = self.reject(Rejection.of(error))
-            except BaseException:  # Too little memory: what was there before is still of use.
-                self._live.resize(num_classes)
-                raise
-            if rejection is not None:  # Nor do classes come with it.
-                self._live.resize(num_classes)
-            return rejection
+                return self.reject(Rejection.of(error))
+        return None
 
-    def _fuse(self, view: View, operator: ViewOperator | None = None) -> Rejection | None:
+    def _fuse(self, view: View, operator: ViewOperator | None = None) -> None:
+        """Add a view; raises `UnusableViewError` where nothing can be learnt from it."""
         self._grow_for(view)
         repeated = view.name in self._live.views
         if not self._live.observe(view, operator):
-            why = self._live.rejected.pop(view.name)
-            return self.reject(Rejection(why.replace(" ", "_"), f"view '{view.name}': {why}"))
+            raise UnusableViewError(self._live.rejected.pop(view.name))
         self.num_fused += not repeated
         self._version += 1
         self._drop_old_views()
-        return None
 
     def reject(self, rejection: Rejection) -> Rejection:
         """Count a view that could not be used."""
