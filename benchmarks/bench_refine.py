@@ -45,13 +45,13 @@ def main() -> None:
     labels, probabilities, observed = make_codes(means)
     k, beta = RefineSettings.k, RefineSettings.beta
     rows = CSRRows.from_dense(np.where(observed[:, None], probabilities, np.float32(0)))
-    unsure = cluster(means, rows, CLASSES, k, beta)[1].mean()
+    unsure = cluster(Neighbours.among(means, k), rows, CLASSES, beta)[1].mean()
 
     print(f"{processor()}, {nb.get_num_threads()} threads, load {load()} before, numba {nb.__version__}")
     print(f"{len(means)} Gaussians, {CLASSES} classes, {unsure:.1%} unsure or unobserved, k = {k}, {REPEATS} runs\n")
     steps = {
-        "cluster": lambda: cluster(means, rows, CLASSES, k, beta),
-        "filter": lambda: statistical_filter(means, labels, k, 1.0, CLASSES),
+        "cluster": lambda: cluster(Neighbours.among(means, k), rows, CLASSES, beta),
+        "filter": lambda: statistical_filter(Neighbours.among(means, k), labels, 1.0),
     }
     steps["cluster + filter"] = lambda: (steps["cluster"](), steps["filter"]())
     searches = {f"search: {name}": search for name, search in neighbour_searches(means, k).items()}

@@ -145,15 +145,8 @@ def _refinement(path: Path, data: Dataset, runs: int) -> Times:
     result = refine(scene)
     known = Neighbours.among(scene.means, settings.k).look_for()
     times["neighbours"] = timed(lambda: Neighbours.among(scene.means, settings.k).look_for(), runs)
-    times["KNN"] = timed(
-        lambda: cluster(scene.means, rows, data.num_classes, settings.k, settings.beta, known, evidence), runs
-    )
-    times["filter"] = timed(
-        lambda: statistical_filter(
-            scene.means, result.labels, settings.k, settings.filter_sigmas, data.num_classes, known
-        ),
-        runs,
-    )
+    times["KNN"] = timed(lambda: cluster(known, rows, data.num_classes, settings.beta, evidence), runs)
+    times["filter"] = timed(lambda: statistical_filter(known, result.labels, settings.filter_sigmas), runs)
     with tempfile.TemporaryDirectory() as out:
         times["export one PLY per class"] = timed(lambda: export_classes(scene, result, f"{out}/classes"), runs)
         times["save segmentation.npz"] = timed(lambda: result.save(f"{out}/segmentation.npz"), runs)

@@ -134,9 +134,7 @@ class Segmentation:
         refined, clustered = codes, np.zeros(len(scene), bool)
         if settings.cluster:
             px, neighbours = evidence if settings.weigh else None, neighbours_of(scene, settings.k)
-            refined, clustered = cluster(
-                scene.means, codes, len(class_names), settings.k, settings.beta, neighbours, px
-            )
+            refined, clustered = cluster(neighbours, codes, len(class_names), settings.beta, px)
         _, labels = largest(refined)  # -1, which is UNOBSERVED, where nothing is known
         learnt = codes.take(np.flatnonzero(clustered))
         return cls(labels, refined, dict(class_names), scene.digest, clustered, learnt, ids=scene.ids)
@@ -152,9 +150,7 @@ class Segmentation:
         self.require(scene)
         if not settings.filter:
             return self
-        neighbours, classes = neighbours_of(scene, settings.k), len(self.class_names)
-        out = statistical_filter(scene.means, self.labels, settings.k, settings.filter_sigmas, classes, neighbours)
-        return self._without(out)
+        return self._without(statistical_filter(neighbours_of(scene, settings.k), self.labels, settings.filter_sigmas))
 
     def calibrated(self, temperature: float) -> Segmentation:
         """Bring all probabilities to a temperature, as `gsseg_core.learn.calibrate` fits it; labels and pictures stay.

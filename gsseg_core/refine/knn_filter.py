@@ -16,12 +16,10 @@ from gsseg_core.spatial.row_order import rows_by_label
 
 
 def cluster(
-    means: np.ndarray,  # (N, 3) float32, finite, scene units
+    neighbours: Neighbours | None,  # of N Gaussians; None if there is only one
     codes: CSRRows,  # N rows of float32 on the simplex; without entries where no view saw the Gaussian
     num_classes: int,
-    k: int = RefineSettings.k,  # at least 1
     beta: float = RefineSettings.beta,
-    neighbours: Neighbours | None = None,  # of `means` for this k, if they are known already
     evidence: np.ndarray | None = None,  # (N,) px that each code stands on, for `neighbour_weights`
 ) -> tuple[CSRRows, np.ndarray]:
     """Give every unsure and every unobserved Gaussian the mean code of the observed ones among its k nearest.
@@ -39,20 +37,19 @@ def cluster(
     >>> import numpy as np
     >>> means = np.array([[0, 0, 0], [1, 0, 0], [3, 0, 0]], np.float32)
     >>> codes = CSRRows.from_dense(np.array([[0, 1], [0.5, 0.5], [0.25, 0.75]], np.float32))
-    >>> clustered, changed = cluster(means, codes, 2, k=1)
+    >>> clustered, changed = cluster(Neighbours.among(means, k=1), codes, 2)
     >>> clustered.dense(2).tolist()
     [[0.0, 1.0], [0.0, 1.0], [0.25, 0.75]]
     """
     most = largest(codes)[0]
     observed = most > 0
     wanted = ~observed | (most < beta)
-    if len(means) < 2 or not wanted.any() or not observed.any():
-        return codes, np.zeros(len(means), bool)
+    if neighbours is None or not wanted.any() or not observed.any():
+        return codes, np.zeros(len(wanted), bool)
     weights = observed if evidence is None else neighbour_weights(observed, evidence)
-    known = neighbours or Neighbours.among(means, k)
-    mean = known.mean_codes(codes, weights, num_classes, wanted)
+    mean = neighbours.mean_codes(codes, weights, num_classes, wanted)
     changed = np.diff(mean.indptr) > 0
-    return codes.replaced(np.where(changed, np.arange(len(means)), -1), mean), changed
+    return codes.replaced(np.where(changed, np.arange(len(changed)), -1), mean), changed
 
 
 def before_clustering(
@@ -67,12 +64,9 @@ def before_clustering(
 
 
 def statistical_filter(
-    means: np.ndarray,  # (N, 3) float32, finite, scene units
+    neighbours: Neighbours | None,  # of N Gaussians; None if there is only one
     labels: np.ndarray,  # (N,) class of each; the background, 0, is no object and not filtered, nor are negative ones
-    k: int = RefineSettings.k,  # at least 1
     sigmas: float = RefineSettings.filter_sigmas,
-    num_classes: int | None = None,  # K; labels from there on are ignored: by default there are none
-    neighbours: Neighbours | None = None,  # of `means` for this k, if they are known already
 ) -> np.ndarray:
     """Find the Gaussians that lie too far from the rest of their own object, and are to be removed: (N,) bool.
 
@@ -85,16 +79,15 @@ def statistical_filter(
     --------
     >>> import numpy as np
     >>> means = np.array([[0, 0, 0], [1, 0, 0], [2, 0, 0], [3, 0, 0], [99, 0, 0]], np.float32)
-    >>> statistical_filter(means, np.array([1, 1, 1, 1, 1])).tolist()
+    >>> statistical_filter(Neighbours.among(means, k=50), np.array([1, 1, 1, 1, 1])).tolist()
     [False, False, False, False, True]
     """
     removed = np.zeros(len(labels), bool)
-    limit = int(labels.max(initial=0)) + 1 if num_classes is None else num_classes
-    if len(means) < 3:
+    if neighbours is None:
         return removed
-    known = class_distances(neighbours or Neighbours.among(means, k), labels, limit)
+    known = class_distances(neighbours, labels)
     for label, members in rows_by_label(labels).items():
-        if not 0 < label < limit or members.size < 3:
+        if label <= 0 or members.size < 3:
             continue
         distances = known[members]
         in_order = np.sort(distances)  # rounding in the mean must not depend on the order of the Gaussians

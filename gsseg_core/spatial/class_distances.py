@@ -21,15 +21,13 @@ MIXED = np.int32(-(2**31))  # stands for the label of a node whose points have s
 NOBODY = np.int32(MIXED + 1)  # the label of no point
 
 
-def class_distances(neighbours: Neighbours, labels: np.ndarray, num_classes: int) -> np.ndarray:  # (N,) int
+def class_distances(neighbours: Neighbours, labels: np.ndarray) -> np.ndarray:  # (N,) int
     """Mean distance to the k nearest others of the same class, or to all if there are not as many: (N,) float64.
 
-    It is in units of the scaled points; NaN where the label is not in 1 to `num_classes` - 1, and where a class has a
-    single member.
+    It is in units of the scaled points; NaN where the label is not above 0, and where a class has a single member.
     """
     tree, k = neighbours.tree, neighbours.k
-    of_point = labels[tree.order].astype(np.int32)
-    of_point[(of_point >= num_classes) | (of_point < 0)] = 0
+    of_point = np.maximum(labels[tree.order], 0).astype(np.int32)
     before = neighbours.by_class or Found.nothing(len(of_point))
     radii, found = before.radii.copy(), before.distances.copy()
     wanted = _to_be_found(tree, of_point, before, k)

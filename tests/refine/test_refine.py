@@ -13,7 +13,7 @@ from scipy.spatial.transform import Rotation
 from gsseg_core.csr_rows import CSRRows
 from gsseg_core.errors import SettingsError
 from gsseg_core.refine import knn_filter as refine
-from gsseg_core.refine.knn_filter import before_clustering, statistical_filter
+from gsseg_core.refine.knn_filter import before_clustering
 from gsseg_core.refine.settings import RefineSettings
 from gsseg_core.scene.gaussian_scene import GaussianScene
 from gsseg_core.spatial import class_distances as class_distances_module
@@ -26,9 +26,18 @@ class Clustered(NamedTuple):
     changed: np.ndarray
 
 
-def cluster(means, probabilities, *settings, **named):
-    rows, changed = refine.cluster(means, CSRRows.from_dense(probabilities), probabilities.shape[1], *settings, **named)
-    return Clustered(rows.dense(probabilities.shape[1]), changed)
+def among(means, k):
+    return Neighbours.among(means, k) if len(means) > 1 else None
+
+
+def cluster(means, probabilities, k=RefineSettings.k, *settings, neighbours=None, **named):
+    codes, num_classes = CSRRows.from_dense(probabilities), probabilities.shape[1]
+    rows, changed = refine.cluster(neighbours or among(means, k), codes, num_classes, *settings, **named)
+    return Clustered(rows.dense(num_classes), changed)
+
+
+def statistical_filter(means, labels, k=RefineSettings.k, *settings):
+    return refine.statistical_filter(among(means, k), labels, *settings)
 
 
 def slow_cluster(means, probabilities, each_weighs, k, beta):
@@ -87,7 +96,7 @@ def test_both_steps_agree_with_their_slow_twins(n, k, on_grid):
     expected, changed = slow_cluster(means, probabilities, weights, k, 0.65)
     np.testing.assert_allclose(result.probabilities, expected, atol=1e-5)
     np.testing.assert_array_equal(result.changed, changed)
-    np.testing.assert_array_equal(statistical_filter(means, labels, k, 1.0, 5), slow_filter(means, labels, k, 1.0, 5))
+    np.testing.assert_array_equal(statistical_filter(means, labels, k, 1.0), slow_filter(means, labels, k, 1.0, 5))
 
 
 @settings(max_examples=15)
@@ -141,14 +150,14 @@ def test_distances_after_some_labels_have_changed_are_those_found_from_nothing(s
         moved = rng.random(n) < share
         labels = np.where(moved, rng.integers(-2, 6, n, np.int32), labels)
         np.testing.assert_array_equal(
-            class_distances(kept, labels, 5), class_distances(Neighbours.among(means, k), labels, 5)
+            class_distances(kept, labels), class_distances(Neighbours.among(means, k), labels)
         )
 
 
 def test_only_what_lies_near_a_changed_label_is_found_anew():
     means = scene(5, 5000)[0]
     labels, neighbours = np.digitize(means[:, 0], [-1, 0, 1]).astype(np.int32), Neighbours.among(means, 10)
-    class_distances(neighbours, labels, 5)
+    class_distances(neighbours, labels)
     of_point = labels[neighbours.tree.order]
     assert not class_distances_module._to_be_found(neighbours.tree, of_point, neighbours.by_class, 10).any()
     of_point[700] = 4 - of_point[700]
@@ -178,7 +187,7 @@ def test_classes_of_one_or_two_the_background_and_negative_labels_are_left_alone
     labels = np.repeat(np.array([0, -1, -2], np.int32), [200, 100, 100])
     labels[:3] = 1, 2, 2
     means[0] = 1000
-    assert not statistical_filter(means, labels, 50, 0.0, 3).any()
+    assert not statistical_filter(means, labels, 50, 0.0).any()
     assert statistical_filter(np.empty((0, 3), np.float32), np.empty(0, np.int32)).shape == (0,)
 
 
@@ -195,7 +204,7 @@ def test_gaussians_at_one_position_and_equal_spacings_stay(position):
     same = np.full((5000, 3), position, np.float32)
     assert not statistical_filter(same, np.ones(5000, np.int32)).any()
     corners = np.eye(3, dtype=np.float32) * 0.1 + np.float32(position)
-    assert not statistical_filter(corners, np.ones(3, np.int32), sigmas=0.0).any()
+    assert not statistical_filter(corners, np.ones(3, np.int32), 50, 0.0).any()
     _, probabilities, observed, _ = scene(5, 5000)
     result = cluster(same, probabilities)
     total = probabilities[observed].sum(axis=0, dtype=np.float64)
@@ -223,7 +232,7 @@ def test_neighbours_are_found_once_per_scene_and_give_the_same_result():
     assert neighbours_of(given_scene, 20) is neighbours and neighbours_of(given_scene, 21) is not neighbours
     with_them = cluster(means, probabilities, 20, neighbours=neighbours)
     np.testing.assert_array_equal(with_them.probabilities, cluster(means, probabilities, 20).probabilities)
-    removed = statistical_filter(means, labels, 20, neighbours=neighbours)
+    removed = refine.statistical_filter(neighbours, labels)
     np.testing.assert_array_equal(removed, statistical_filter(means, labels, 20))
     assert neighbours_of(given_scene.subset([0]), 20) is None
 
@@ -247,7 +256,7 @@ def test_background_that_is_sure_of_itself_is_never_looked_for():
     means, _, _, labels = scene(10, 600)
     known = Neighbours.among(means, 20)
     labels = np.where(np.arange(600) < 300, 0, np.maximum(labels, 1))
-    statistical_filter(means, labels, 20, neighbours=known)
+    refine.statistical_filter(known, labels)
     np.testing.assert_array_equal(np.isnan(known.radii), labels[known.tree.order] == 0)
 
 
