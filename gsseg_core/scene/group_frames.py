@@ -14,6 +14,7 @@ import numpy.typing as npt
 
 from gsseg_core.scene import spherical_harmonics
 from gsseg_core.scene.gaussian_scene import ACTIVATED, GaussianScene
+from gsseg_core.scene.quaternions import turned_quats
 from gsseg_core.scene.scene_ids import with_ids
 from gsseg_core.scene.similarity import Similarity
 from gsseg_core.scene.vertices import MEANS, QUATS, SCALES, chosen, columns, put, rest_of
@@ -46,7 +47,7 @@ def moved_geometry(scene: GaussianScene, which: npt.NDArray[np.bool_], frame: Si
     """Move some Gaussians from a frame to the one that it lies in; their vertices, and so colours, are not moved."""
     means, quats, scales = scene.means.copy(), scene.quats.copy(), scene.scales.copy()
     means[which] = _points(means[which], frame)
-    quats[which] = _turned(quats[which], frame)
+    quats[which] = turned_quats(quats[which], frame.rotation)
     scales[which] = (scales[which].astype(np.float64) * frame.scale).astype(np.float32)
     return replace(scene, means=means, quats=quats, scales=scales)
 
@@ -56,7 +57,7 @@ def moved_scene(scene: GaussianScene, frame: Similarity) -> GaussianScene:
     vertices = scene.vertices.copy()
     logs = columns(vertices, SCALES).astype(np.float64) + np.log(frame.scale)
     put(vertices, MEANS, _points(scene.means, frame))
-    put(vertices, QUATS, _turned(scene.quats, frame))
+    put(vertices, QUATS, turned_quats(scene.quats, frame.rotation))
     put(vertices, SCALES, logs)
     if names := rest_of(vertices):
         turned = spherical_harmonics.turned(frame.rotation, scene.sh_degree)[1:, 1:]
@@ -72,30 +73,15 @@ def joined(
     ids: npt.NDArray[np.int64],  # (N',)
 ) -> GaussianScene:
     """Append Gaussians to those that stay; from now on, the scene holds ids. Raises what `with_ids` does."""
-    parts: dict[str, list[npt.NDArray[Any]]] = {name: [getattr(scene, name)[stays]] for name in ACTIVATED}
-    if added is not None:
-        for name in ACTIVATED:
-            parts[name].append(getattr(added, name))
-    vertices = with_ids(chosen(scene.vertices, np.flatnonzero(stays)), None if added is None else added.vertices, ids)
-    arrays: dict[str, Any] = {name: np.concatenate(part) for name, part in parts.items()}
-    return replace(scene, **arrays, vertices=vertices)
+    kept = chosen(scene.vertices, np.flatnonzero(stays))
+    if added is None:
+        arrays: dict[str, Any] = {name: getattr(scene, name)[stays] for name in ACTIVATED}
+        return replace(scene, **arrays, vertices=with_ids(kept, None, ids))
+    arrays = {name: np.concatenate([getattr(scene, name)[stays], getattr(added, name)]) for name in ACTIVATED}
+    return replace(scene, **arrays, vertices=with_ids(kept, added.vertices, ids))
 
 
 def _points(means: npt.NDArray[np.float32], frame: Similarity) -> npt.NDArray[np.float64]:
     x, y, z = means.astype(np.float64).T
     rows = [frame.scale * (r[0] * x + r[1] * y + r[2] * z) for r in frame.rotation]
     return np.stack([row + shift for row, shift in zip(rows, frame.translation, strict=True)], axis=1)
-
-
-def _turned(quats: npt.NDArray[np.float32], frame: Similarity) -> npt.NDArray[np.float64]:
-    from scipy.spatial.transform import Rotation  # It takes a while to load, and few scenes move.
-
-    b, c, d, a = Rotation.from_matrix(frame.rotation).as_quat()
-    w, x, y, z = quats.astype(np.float64).T
-    product = [
-        a * w - b * x - c * y - d * z,
-        a * x + b * w + c * z - d * y,
-        a * y - b * z + c * w + d * x,
-        a * z + b * y - c * x + d * w,
-    ]
-    return np.stack(product, axis=1)

@@ -8,6 +8,7 @@ import numpy as np
 import numpy.typing as npt
 
 from gsseg_core.scene import spherical_harmonics
+from gsseg_core.scene.quaternions import turned_quats
 from gsseg_core.scene.vertices import MEANS, QUATS, REST_COUNTS, SCALES, columns, put, rest_of
 
 
@@ -31,7 +32,7 @@ def move(
             _change_signs(vertices, np.diag(turn), names, np.diag(harmonics))
             return
         # A Gaussian is its own mirror image through its centre, so a mirror is half a turn of it.
-        put(vertices, QUATS, _rotated(columns(vertices, QUATS), turn if np.linalg.det(turn) > 0 else -turn))
+        put(vertices, QUATS, turned_quats(columns(vertices, QUATS), turn if np.linalg.det(turn) > 0 else -turn))
         if names:
             rest = columns(vertices, names).reshape(len(vertices), 3, -1)
             rest[:] = rest @ harmonics.T.astype(np.float32)
@@ -56,12 +57,3 @@ def _change_signs(
     signs[[order.index(name) for name in names]] = np.tile(harmonics, 3)
     table = vertices.view(np.float32).reshape(len(vertices), -1)
     table *= signs
-
-
-def _rotated(quats: npt.NDArray[np.float32], turn: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
-    """Quaternions (N, 4) w, x, y, z of rotations by `quats` (N, 4), then by a matrix (3, 3)."""
-    from scipy.spatial.transform import Rotation  # It takes a while to load, and few formats need it.
-
-    x, y, z, w = Rotation.from_matrix(turn).as_quat()
-    product = np.array([[w, -x, -y, -z], [x, w, -z, y], [y, z, w, -x], [z, -y, x, w]])
-    return quats.astype(np.float64) @ product.T

@@ -1,4 +1,4 @@
-"""Rotation matrices of unit quaternions, and quaternions of which a file keeps the three smallest components."""
+"""Unit quaternions: rotation matrices of them, products, and those of which a file keeps the three smallest parts."""
 
 from __future__ import annotations
 
@@ -19,6 +19,24 @@ def rotations(quats: npt.NDArray[Number]) -> npt.NDArray[Number]:  # (M, 4) w, x
         [2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)],
     ]
     return np.moveaxis(np.array(rows), 2, 0)
+
+
+def turned_quats(
+    quats: npt.NDArray[np.floating],  # (N, 4) w, x, y, z
+    turn: npt.NDArray[np.float64],  # (3, 3)
+) -> npt.NDArray[np.float64]:
+    """Quaternions (N, 4) of rotations by `quats`, then by a matrix; each is the same whichever others are turned."""
+    from scipy.spatial.transform import Rotation  # It takes a while to load, and few scenes are turned.
+
+    b, c, d, a = Rotation.from_matrix(turn).as_quat()
+    w, x, y, z = quats.astype(np.float64).T
+    product = [
+        a * w - b * x - c * y - d * z,
+        a * x + b * w + c * z - d * y,
+        a * y - b * z + c * w + d * x,
+        a * z + b * y - c * x + d * w,
+    ]
+    return np.stack(product, axis=1)
 
 
 def half_axes(
