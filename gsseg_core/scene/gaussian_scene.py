@@ -22,6 +22,7 @@ from gsseg_core.scene.scene_ids import read_ids
 from gsseg_core.scene.vertices import (
     BLOCK,
     DC,
+    GEOMETRY,
     MEANS,
     OPACITY,
     QUATS,
@@ -237,7 +238,7 @@ class GaussianScene:
         """SHA-256 (hex) of the geometry: positions, opacities, scales and rotations as stored, not colours."""
         digest = hashlib.sha256()
         for start in range(0, len(self), BLOCK):
-            geometry = columns(self.vertices[start : start + BLOCK], MEANS + OPACITY + SCALES + QUATS)
+            geometry = columns(self.vertices[start : start + BLOCK], GEOMETRY)
             digest.update(np.ascontiguousarray(geometry, "<f4").data)
         return digest.hexdigest()
 

@@ -25,9 +25,8 @@ from gsseg_core.scene.group_frames import IDENTITY, is_identity, joined, moved_g
 from gsseg_core.scene.scene_delta import MAX_ID, SceneDelta, read_similarity, similarity_entry, straightened
 from gsseg_core.scene.scene_ids import with_ids
 from gsseg_core.scene.similarity import Similarity
-from gsseg_core.scene.vertices import MEANS, OPACITY, QUATS, SCALES, columns, pack_vertices
+from gsseg_core.scene.vertices import GEOMETRY, columns, pack_vertices
 
-_GEOMETRY = MEANS + OPACITY + SCALES + QUATS
 _FRAMES_KEPT = 2  # scenes in the frames of groups; views of one group come one after the other
 
 
@@ -73,7 +72,7 @@ class LivingScene:
         frames: Mapping[int, Similarity],
     ) -> LivingScene:  # fmt: skip
         """Make a scene of N Gaussians, given in the frames of their groups."""
-        far = np.isin(groups, [group for group, frame in frames.items() if not is_identity(frame)])
+        far = _are_far(groups, frames)
         scene = cls._placed(local, local, groups, frames, far) if far.any() else local
         return cls(scene, local, ids, groups, frames)
 
@@ -87,7 +86,7 @@ class LivingScene:
         """Read a scene, colourless, if the npz of a saved state holds one; `UnfitError` if what is there is none."""
         if "geometry" not in file.names:
             return None
-        geometry = file.expect("geometry", np.float32, (None, len(_GEOMETRY)))
+        geometry = file.expect("geometry", np.float32, (None, len(GEOMETRY)))
         ids, groups = (file.expect(name, np.int64, (len(geometry),)) for name in ("ids", "groups"))
         if ids.min(initial=0) < 0 or len(np.unique(ids)) < len(ids):
             raise UnfitError(
@@ -110,7 +109,7 @@ class LivingScene:
 
     def arrays(self) -> dict[str, npt.NDArray[Any]]:
         """Arrays that `read` takes, besides the frames: ids, groups, and geometry without colours."""
-        return {"ids": self.ids, "groups": self.groups, "geometry": columns(self.local.vertices, _GEOMETRY)}
+        return {"ids": self.ids, "groups": self.groups, "geometry": columns(self.local.vertices, GEOMETRY)}
 
     def frame_entries(self) -> list[dict[str, Any]]:
         """Frames of the groups, as `read` takes them, for a JSON header."""
@@ -118,7 +117,7 @@ class LivingScene:
 
     def without_colours(self) -> LivingScene:
         """Drop the colours of the scene: its votes stay the same, bit for bit, and it takes a fifth of the memory."""
-        local = _colourless(columns(self.local.vertices, _GEOMETRY))
+        local = _colourless(columns(self.local.vertices, GEOMETRY))
         return LivingScene.placed(local, self.ids, self.groups, self.frames)
 
     def flat(self) -> LivingScene:
@@ -192,13 +191,10 @@ class LivingScene:
         groups = np.concatenate([self.groups[stays], delta.added_groups])
         local = joined(self.local, stays, delta.added, ids)
         scene = local if self.scene is self.local else joined(self.scene, stays, delta.added, ids)
-        far = {group for group, frame in frames.items() if not is_identity(frame)}
         # What is added to a group that was moved before is in its frame, too.
-        changed = np.isin(groups, list(far & {move.group for move in delta.moves}))
-        changed |= (origin < 0) & np.isin(groups, list(far))
-        back = {move.group for move in delta.moves} - far
-        if changed.any() or back:
-            scene = self._placed(scene, local, groups, frames, changed | np.isin(groups, list(back)))
+        changed = np.isin(groups, [move.group for move in delta.moves]) | ((origin < 0) & _are_far(groups, frames))
+        if changed.any():
+            scene = self._placed(scene, local, groups, frames, changed)
         return LivingScene(scene, local, ids, groups, frames, revision), origin
 
     def _next_revision(self, delta: SceneDelta) -> int | None:
@@ -253,6 +249,11 @@ class LivingScene:
             for name, array in arrays.items():
                 array[here] = getattr(part, name)
         return replace(scene, **arrays)
+
+
+def _are_far(groups: npt.NDArray[np.int64], frames: Mapping[int, Similarity]) -> npt.NDArray[np.bool_]:  # (N,)
+    """Mark the Gaussians of groups that are not where they were given, (N,)."""
+    return np.isin(groups, [group for group, frame in frames.items() if not is_identity(frame)])
 
 
 def _colourless(geometry: npt.NDArray[np.float32]) -> GaussianScene:  # (N, 11)

@@ -18,6 +18,7 @@ DC = ("f_dc_0", "f_dc_1", "f_dc_2")
 OPACITY = ("opacity",)
 SCALES = ("scale_0", "scale_1", "scale_2")
 QUATS = ("rot_0", "rot_1", "rot_2", "rot_3")
+GEOMETRY = MEANS + OPACITY + SCALES + QUATS  # all but colours
 BLOCK = 1 << 15  # Gaussians that are packed or unpacked at a time
 REST_COUNTS = tuple(3 * (d + 1) ** 2 - 3 for d in range(spherical_harmonics.MAX_DEGREE + 1))
 """How many properties f_rest_* a scene of SH degree 0, 1, 2, 3 has."""
