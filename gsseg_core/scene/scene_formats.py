@@ -24,7 +24,8 @@ class SceneFormat:
     The reader gets a file, and a folder below which that must lie, or None. It returns the Gaussians in the order of
     the file, as vertices of a 3DGS PLY (`gsseg_core.scene.vertices.pack_vertices`), and raises `SceneFileError` where
     the file is missing, broken, of another version, or does not hold what its header says. `marks` tells from the first
-    bytes of a file, whatever its suffix, that it is of this format; without it the suffix decides.
+    bytes of a file, whatever its suffix, that it is of this format, or of one behind it in the table that marks it more
+    closely; without it the suffix decides.
     """
 
     name: str
@@ -40,7 +41,7 @@ class SceneFormat:
 
 
 SCENE_FORMATS = [
-    SceneFormat("3DGS PLY", ply_variants.read_3dgs, (".ply",), "everything, but SH up to degree 3"),
+    SceneFormat("3DGS PLY", ply_variants.read_3dgs, (".ply",), "everything, but SH up to degree 3", ply.is_ply),
     SceneFormat(
         "PlayCanvas compressed PLY", compressed_ply.read_compressed_ply, (".compressed.ply",),
         "SH degree 0 to 3 in 8 bits; positions and scales in 10 to 11 bits per block of 256, rotations in 10, colours "
@@ -103,9 +104,7 @@ def find_format(path: Path, within: Path | None = None) -> SceneFormat | None:
             head = file.read(_HEAD)
     except OSError:
         head = b""
-    by_content = [known for known in SCENE_FORMATS if known.marks and known.marks(head)]
-    if ply.is_ply(head):  # None of its variants, perhaps; and no suffix makes it something else.
-        by_content.append(SCENE_FORMATS[0])
+    by_content = [known for known in reversed(SCENE_FORMATS) if known.marks and known.marks(head)]
     return next(iter([*by_content, *suited]), None)
 
 
