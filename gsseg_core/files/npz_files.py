@@ -296,7 +296,7 @@ def open_arrays(path: Path, expected: str, error: type[GssegError], within: Path
         raise error(f"{path}: is not {expected}, or is damaged ({reason(cause)})") from cause
 
 
-def read_json_header(arrays: NpzArrays) -> dict[str, Any]:
+def _read_json_header(arrays: NpzArrays) -> dict[str, Any]:
     """Read the JSON header of an npz; `ValueError` if it is no object."""
     header = json.loads(arrays.text("header"))
     if not isinstance(header, dict):
@@ -306,18 +306,23 @@ def read_json_header(arrays: NpzArrays) -> dict[str, Any]:
 
 @contextmanager
 def open_npz(
-    path: Path, what: str, formats: Sequence[str], digest: str | None, within: Path | None = None
+    path: Path,
+    what: str,
+    formats: Sequence[str],
+    digest: str | None,
+    within: Path | None = None,
+    error: type[GssegError] = StateFileError,
 ) -> Iterator[tuple[NpzArrays, Any]]:
     """Open an npz whose JSON header must name one of `formats`, the newest first, and `digest`, if given, as "scene".
 
-    Yields the arrays and the header. Raises `StateFileError` where the file is missing, damaged, also as the body finds
-    out, or of another format, `StateMismatchError` where it belongs to another scene, and `PathNotAllowedError` where
-    it lies outside `within`.
+    Yields the arrays and the header. Raises `error` where the file is missing, damaged, also as the body finds out, or
+    of another format, `StateMismatchError` where it belongs to another scene, and `PathNotAllowedError` where it lies
+    outside `within`.
     """
-    with open_arrays(path, what, StateFileError, within) as arrays:
-        header = read_json_header(arrays)
+    with open_arrays(path, what, error, within) as arrays:
+        header = _read_json_header(arrays)
         if header.get("format") not in formats:
-            raise StateFileError(f"{path}: format is {quoted(header.get('format'))}; expected {formats[0]!r}")
+            raise UnfitError(f"format is {quoted(header.get('format'))}; expected {formats[0]!r}")
         if digest is not None:
             check_scene(path, header, digest)
         yield arrays, header
@@ -335,5 +340,5 @@ def check_scene(path: Path, header: dict[str, Any], digest: str) -> None:
 def npz_format(path: Path) -> str:
     """Read the format that the header of an npz names; "" if the file is missing, damaged or names none."""
     with suppress(GssegError), open_arrays(path, "an npz with a header", GssegError) as arrays:
-        return str(read_json_header(arrays)["format"])
+        return str(_read_json_header(arrays)["format"])
     return ""

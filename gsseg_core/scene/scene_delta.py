@@ -14,7 +14,7 @@ from gsseg_core.errors import EmptySceneError, SceneDeltaError, SceneValueError
 from gsseg_core.files.input_files import UnfitError
 from gsseg_core.files.json_files import whole_number
 from gsseg_core.files.limits import LIMITS
-from gsseg_core.files.npz_files import open_arrays, read_json_header, write_npz
+from gsseg_core.files.npz_files import open_npz, write_npz
 from gsseg_core.scene.gaussian_scene import ACTIVATED, GaussianScene
 from gsseg_core.scene.similarity import Similarity
 from gsseg_core.text import clipped, quoted
@@ -140,10 +140,7 @@ class SceneDelta:
 
     @classmethod
     def _read(cls, path: Path, within: Path | None) -> SceneDelta:
-        with open_arrays(path, "a scene delta", SceneDeltaError, within) as file:
-            header = read_json_header(file)
-            if header.get("format") != FORMAT:
-                raise UnfitError(f"format is {quoted(header.get('format'))}; expected {FORMAT!r}")
+        with open_npz(path, "a scene delta", (FORMAT,), None, within, SceneDeltaError) as (file, header):
             revision = header.get("revision")
             if revision is not None:
                 whole_number(revision, "revision", 0, MAX_ID)
