@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import struct
+from itertools import pairwise
 from pathlib import Path
 from typing import NamedTuple
 
@@ -11,11 +12,9 @@ import numpy.typing as npt
 
 from gsseg_core.files.input_files import UnfitError
 from gsseg_core.scene.scene_file import check_size, open_scene
-from gsseg_core.scene.vertices import ReadScene, dc_of, log_scales, logits, pack_vertices
+from gsseg_core.scene.vertices import REST_COUNTS, ReadScene, dc_of, log_scales, logits, pack_vertices
 
 _HEADER, _SECTION = 4096, 1024  # bytes of the header of the file, and of each section
-_SH_COUNTS = (0, 9, 24, 45)  # numbers of SH per Gaussian above degree 0, by degree
-_BANDS = ((0, 3), (3, 8), (8, 15))  # coefficients of degree 1, 2 and 3
 _SH_RANGE = (-1.5, 1.5)  # where the header says none
 
 
@@ -60,7 +59,7 @@ def read_ksplat(path: Path, within: Path | None = None) -> ReadScene:
 def _section(content: bytes, place: int) -> _Section:
     section = _Section(*struct.unpack_from("<4IfH2xI4x2IH", content, place))
     count, capacity, degree = section.gaussians, section.capacity, section.degree
-    if degree >= len(_SH_COUNTS) or count > capacity:
+    if degree >= len(REST_COUNTS) or count > capacity:
         raise UnfitError(f"has a section of {count:,} in {capacity:,} and SH degree {degree}; expected degree 0 to 3")
     return section
 
@@ -71,7 +70,7 @@ def _record(level: int, degree: int) -> np.dtype[np.void]:
     return np.dtype(
         [
             ("mean", place, 3), ("scale", number, 3), ("quat", number, 4), ("rgba", "u1", 4),
-            ("sh", harmonic, (_SH_COUNTS[degree],)),
+            ("sh", harmonic, (REST_COUNTS[degree],)),
         ]
     )  # fmt: skip
 
@@ -131,7 +130,7 @@ def _rest(
         return None
     if level == 2:
         sh = sh_range[0] + sh * np.float32((sh_range[1] - sh_range[0]) / 255)
-    rest = np.zeros((len(sh), _BANDS[highest - 1][1], 3), np.float32)
-    for a, b in _BANDS[:degree]:
-        rest[:, a:b] = sh[:, 3 * a : 3 * b].reshape(len(sh), 3, b - a).transpose(0, 2, 1)
+    rest = np.zeros((len(sh), REST_COUNTS[highest] // 3, 3), np.float32)
+    for begin, end in pairwise(REST_COUNTS[: degree + 1]):
+        rest[:, begin // 3 : end // 3] = sh[:, begin:end].reshape(len(sh), 3, -1).transpose(0, 2, 1)
     return rest

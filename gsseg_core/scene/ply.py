@@ -5,9 +5,10 @@ from __future__ import annotations
 import io
 import os
 from collections.abc import Iterable
+from io import BufferedReader
 from itertools import islice
 from pathlib import Path
-from typing import Any, BinaryIO
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -15,7 +16,7 @@ import plyfile
 
 from gsseg_core.errors import SceneFileError, ScenePropertyError
 from gsseg_core.files.atomic import write_atomically
-from gsseg_core.scene.scene_file import open_scene
+from gsseg_core.scene.scene_file import open_scene, size_of
 from gsseg_core.text import clipped, quoted
 
 _MAX_HEADER = 1 << 20
@@ -80,7 +81,7 @@ def is_ply(head: bytes) -> bool:
     return head.startswith((b"ply\n", b"ply\r"))
 
 
-def _read_header(file: BinaryIO) -> Any:
+def _read_header(file: BufferedReader) -> Any:
     """Read the header of a PLY, up to the first row; raises `ValueError` if the file is too short for its counts."""
     head = file.read(_MAX_HEADER)
     if not is_ply(head):
@@ -91,7 +92,7 @@ def _read_header(file: BinaryIO) -> Any:
     header = io.StringIO(head.translate(_PLAIN).decode("ascii"), newline="")
     ply = plyfile.PlyData._parse_header(header)
     file.seek(header.tell())
-    left = os.fstat(file.fileno()).st_size - header.tell()
+    left = size_of(file) - header.tell()
     for element in ply:
         if ply.text and element.count and not element.properties:  # An empty line each, perhaps, or none.
             raise ValueError(f"element {quoted(element.name)} of {element.count:,} rows has no properties")
