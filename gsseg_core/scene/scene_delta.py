@@ -10,11 +10,11 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from gsseg_core.errors import EmptySceneError, SceneDeltaError, SceneValueError
+from gsseg_core.errors import GssegError, SceneDeltaError
 from gsseg_core.files.input_files import UnfitError
 from gsseg_core.files.json_files import whole_number
 from gsseg_core.files.limits import LIMITS
-from gsseg_core.files.npz_files import open_npz, write_npz
+from gsseg_core.files.npz_files import NpzArrays, open_npz, write_npz
 from gsseg_core.scene.gaussian_scene import ACTIVATED, GaussianScene
 from gsseg_core.scene.similarity import Similarity
 from gsseg_core.text import clipped, quoted
@@ -131,28 +131,26 @@ class SceneDelta:
         PathNotAllowedError
             The file lies outside `within`.
         """
-        path = Path(path)
-        try:
-            return cls._read(path, within)
-        except (SceneDeltaError, SceneValueError, EmptySceneError) as error:
-            named = str(error).startswith(str(path))
-            raise SceneDeltaError(str(error) if named else f"{path}: {error}") from error
+        with open_npz(Path(path), "a scene delta", (FORMAT,), None, within, SceneDeltaError) as (file, header):
+            try:
+                return cls._read(file, header)
+            except GssegError as error:  # of what is in it
+                raise UnfitError(str(error)) from error
 
     @classmethod
-    def _read(cls, path: Path, within: Path | None) -> SceneDelta:
-        with open_npz(path, "a scene delta", (FORMAT,), None, within, SceneDeltaError) as (file, header):
-            revision = header.get("revision")
-            if revision is not None:
-                whole_number(revision, "revision", 0, MAX_ID)
-            removed = file.expect("removed", np.int64, (None,))
-            moves = tuple(_read_move(entry) for entry in header["moves"])
-            if "added_ids" not in file.names:
-                return cls(revision, removed, moves=moves)
-            ids = file.expect("added_ids", np.int64, (None,))
-            groups = file.expect("added_groups", np.int64, (len(ids),))
-            shapes = {"means": (3,), "quats": (4,), "scales": (3,), "opacities": (), "sh": (None, 3)}
-            arrays = [file.expect(name, np.float32, (len(ids), *shape)) for name, shape in shapes.items()]
-            return cls(revision, removed, GaussianScene.from_arrays(*arrays), ids, groups, moves)
+    def _read(cls, file: NpzArrays, header: dict[str, Any]) -> SceneDelta:
+        revision = header.get("revision")
+        if revision is not None:
+            whole_number(revision, "revision", 0, MAX_ID)
+        removed = file.expect("removed", np.int64, (None,))
+        moves = tuple(_read_move(entry) for entry in header["moves"])
+        if "added_ids" not in file.names:
+            return cls(revision, removed, moves=moves)
+        ids = file.expect("added_ids", np.int64, (None,))
+        groups = file.expect("added_groups", np.int64, (len(ids),))
+        shapes = {"means": (3,), "quats": (4,), "scales": (3,), "opacities": (), "sh": (None, 3)}
+        arrays = [file.expect(name, np.float32, (len(ids), *shape)) for name, shape in shapes.items()]
+        return cls(revision, removed, GaussianScene.from_arrays(*arrays), ids, groups, moves)
 
 
 def check_similarity(motion: Similarity, who: str) -> None:
