@@ -113,7 +113,7 @@ class _Reader:
     def _splats(self, primitive: Any, matrix: npt.NDArray[np.float64]) -> npt.NDArray[np.void]:
         compressed = primitive["extensions"][_SPLATS].get("extensions", {}).get(_SPZ)
         if compressed is not None:
-            vertices = decode_spz(io.BytesIO(self._view(compressed["bufferView"])), self._path).vertices
+            vertices = decode_spz(io.BytesIO(self._view(compressed["bufferView"]))).vertices
             move(vertices, _TO_PLY)  # As the node moves what is in the axes of glTF.
         else:
             vertices = self._plain(primitive["attributes"])

@@ -6,14 +6,13 @@ import gzip
 import math
 import struct
 from collections.abc import Callable, Iterator
-from io import BufferedReader, BytesIO
+from io import BytesIO
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import BinaryIO, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
 
-from gsseg_core.errors import SceneFileError
 from gsseg_core.files.input_files import UnfitError
 from gsseg_core.scene.moving import move
 from gsseg_core.scene.quaternions import from_smallest_three
@@ -69,17 +68,17 @@ def read_spz(path: Path, within: Path | None = None) -> ReadScene:
     package zstandard.
     """
     with open_scene(path, within, "an SPZ file") as file:
-        return decode_spz(file, path)
+        return decode_spz(file)
 
 
-def decode_spz(file: Any, path: Path) -> ReadScene:
-    """Decode SPZ from an open binary file; raises `SceneFileError`, or what `open_scene` takes for damage."""
+def decode_spz(file: BinaryIO) -> ReadScene:
+    """Decode SPZ from an open binary file; raises what `open_scene` takes for damage."""
     magic, length = file.read(4), file.seek(0, 2)
     file.seek(0)
     if magic.startswith(_GZIP):
         header, system, readers = _inflate(file, length)
     elif magic == _MAGIC:
-        header, system, readers = _streams(file, length, path)
+        header, system, readers = _streams(file, length)
     else:
         raise ValueError("it starts neither with NGSP nor as gzip does")
     count, (*before, of_sh) = header.gaussians, header.sizes
@@ -128,7 +127,7 @@ def _rows(read: Read, count: int, size: int) -> npt.NDArray[np.uint8]:
     return np.frombuffer(content, np.uint8).reshape(count, size)
 
 
-def _inflate(file: Any, length: int) -> tuple[_Header, str, Iterator[Read]]:
+def _inflate(file: BinaryIO, length: int) -> tuple[_Header, str, Iterator[Read]]:
     """Open gzip, of versions 1 to 3: header, axes, and a reader of each attribute, to be read to its end in turn."""
     stream = gzip.GzipFile(fileobj=file)
     header = _header(stream.read(_HEADER.size))
@@ -146,13 +145,13 @@ def _inflate(file: Any, length: int) -> tuple[_Header, str, Iterator[Read]]:
     return header, "RUB", readers()
 
 
-def _streams(file: BufferedReader, length: int, path: Path) -> tuple[_Header, str, Iterator[Read]]:
+def _streams(file: BinaryIO, length: int) -> tuple[_Header, str, Iterator[Read]]:
     """Open the streams of version 4, as `_inflate` does; the file leaves out those of no bytes."""
     try:
         from zstandard import ZstdDecompressor, ZstdError
     except ImportError as error:
-        raise SceneFileError(
-            f"{path}: is SPZ of version 4, which takes the package zstandard: pip install 'gsseg[formats]'"
+        raise UnfitError(
+            "is SPZ of version 4, which takes the package zstandard: pip install 'gsseg[formats]'"
         ) from error
     content = file.read(_HEADER_4)
     header = _header(content)
