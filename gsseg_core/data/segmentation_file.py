@@ -55,6 +55,6 @@ def read_segmentation(path: Path, digest: str, num_gaussians: int) -> dict[str, 
 
 
 def _expect_rows(file: NpzArrays, name: str, shape: tuple[int, int]) -> CSRRows:
-    """Read probabilities, as `arrays_of_rows` has written them; older files have them with all their zeros."""
+    """Read probabilities as `arrays_of_rows` has written them: with their zeros, or without where these are many."""
     expect = file.expect_sparse if f"{name}_counts" in file.names else file.expect_rows
     return expect(name, np.float32, shape)

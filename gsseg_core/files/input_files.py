@@ -92,17 +92,17 @@ def open_expected(
 
 
 def read_input(
-    path: str | os.PathLike[str], error: type[GssegError], within: Path | None = None, first: int | None = None
+    path: str | os.PathLike[str], error: type[GssegError], within: Path | None = None, most: int | None = None
 ) -> bytes:
-    """Read a file, or its first bytes, below `within` if given.
+    """Read a file, below `within` if given; raise `error` if it cannot be read, or has more than so many bytes.
 
-    Raises `error` if it cannot be read, or is larger than any JSON file is, as `Limits.max_json_bytes` says.
+    By default, that is as many as any JSON file has, `Limits.max_json_bytes`.
     """
-    limit = LIMITS.max_json_bytes
+    limit, named = (LIMITS.max_json_bytes, " (limit max_json_bytes)") if most is None else (most, "")
     with open_expected(path, error, within=within) as file:
-        content = file.read(limit + 1 if first is None else first)
+        content = file.read(limit + 1)
     if len(content) > limit:
-        raise error(f"{path}: is too large; expected at most {limit:,} bytes (limit max_json_bytes)")
+        raise error(f"{path}: is too large; expected at most {limit:,} bytes{named}")
     return content
 
 

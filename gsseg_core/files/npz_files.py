@@ -136,15 +136,18 @@ class NpzArrays:
             raise ValueError(f"there is no array {name!r}")
         return self._archive.open(name + _SUFFIX)
 
-    def text(self, name: str) -> str:
-        """Read an array that is one text, of `Limits.max_json_bytes` at most."""
-        header = self.header(name)
-        if header.dtype.kind != "U" or header.shape != () or header.dtype.itemsize > 4 * LIMITS.max_json_bytes:
-            raise ValueError(f"array {name!r} is {header}; expected one text")
-        text = self.read(name)
+    def json_header(self) -> dict[str, Any]:
+        """Read the JSON header, the array `header` that is one text, of `Limits.max_json_bytes` at most."""
+        found = self.header("header")
+        if found.dtype.kind != "U" or found.shape != () or found.dtype.itemsize > 4 * LIMITS.max_json_bytes:
+            raise ValueError(f"array 'header' is {found}; expected one text")
+        text = self.read("header")
         if text.reshape(1).view(text.dtype.byteorder + "u4").max(initial=0) > sys.maxunicode:
-            raise ValueError(f"array {name!r} holds what is no character")
-        return str(text)
+            raise ValueError("array 'header' holds what is no character")
+        header = json.loads(str(text))
+        if not isinstance(header, dict):
+            raise ValueError("its header is no JSON object")
+        return header
 
 
 def _check_end(member: IO[bytes], name: str) -> None:
@@ -296,14 +299,6 @@ def open_arrays(path: Path, expected: str, error: type[GssegError], within: Path
         raise error(f"{path}: is not {expected}, or is damaged ({reason(cause)})") from cause
 
 
-def _read_json_header(arrays: NpzArrays) -> dict[str, Any]:
-    """Read the JSON header of an npz; `ValueError` if it is no object."""
-    header = json.loads(arrays.text("header"))
-    if not isinstance(header, dict):
-        raise ValueError("its header is no JSON object")
-    return header
-
-
 @contextmanager
 def open_npz(
     path: Path,
@@ -320,7 +315,7 @@ def open_npz(
     outside `within`.
     """
     with open_arrays(path, what, error, within) as arrays:
-        header = _read_json_header(arrays)
+        header = arrays.json_header()
         if header.get("format") not in formats:
             raise UnfitError(f"format is {quoted(header.get('format'))}; expected {formats[0]!r}")
         if digest is not None:
@@ -340,5 +335,5 @@ def check_scene(path: Path, header: dict[str, Any], digest: str) -> None:
 def npz_format(path: Path) -> str:
     """Read the format that the header of an npz names; "" if the file is missing, damaged or names none."""
     with suppress(GssegError), open_arrays(path, "an npz with a header", GssegError) as arrays:
-        return str(_read_json_header(arrays)["format"])
+        return str(arrays.json_header()["format"])
     return ""

@@ -22,9 +22,7 @@ def read_yaml(path: Path, error: type[GssegError], within: Path | None = None) -
         import yaml
     except ModuleNotFoundError as missing:
         raise SettingsError(f"{path}: needs PyYAML, which is missing: pip install 'gsseg[formats]'") from missing
-    content = read_input(path, error, within, _MOST_BYTES + 1)
-    if len(content) > _MOST_BYTES:
-        raise error(f"{path}: is too large; expected at most {_MOST_BYTES:,} bytes")
+    content = read_input(path, error, within, _MOST_BYTES)
     try:
         if any(isinstance(event, yaml.AliasEvent) for event in yaml.parse(content, yaml.SafeLoader)):
             raise error(f"{path}: uses anchors, as in *name; expected YAML without")

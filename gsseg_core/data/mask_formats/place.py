@@ -10,7 +10,7 @@ from pathlib import Path, PureWindowsPath
 from typing import TypeVar
 
 from gsseg_core.errors import MaskFormatError
-from gsseg_core.files.input_files import IMAGE_SUFFIXES, list_below, list_folder, read_input
+from gsseg_core.files.input_files import IMAGE_SUFFIXES, list_below, list_folder, open_expected, read_input
 from gsseg_core.files.json_files import read_json
 from gsseg_core.text import clipped, composed
 
@@ -151,7 +151,8 @@ class Place:
 
     def holds(self, path: Path, pattern: bytes) -> bool:
         """Tell whether a file begins with a pattern, a regular expression, within its first 4096 bytes."""
-        return re.match(pattern, read_input(path, MaskFormatError, self.within, _PEEKED)) is not None
+        with open_expected(path, MaskFormatError, within=self.within) as file:
+            return re.match(pattern, file.read(_PEEKED)) is not None
 
     def read(self, path: Path) -> bytes:
         """Read a file; `MaskFormatError` if it cannot be read, or is larger than any such file is."""
