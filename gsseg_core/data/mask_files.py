@@ -16,7 +16,7 @@ import numpy.typing as npt
 from gsseg_core.data.mask_formats.place import view_of, views_below
 from gsseg_core.data.soft_masks import SeenLabels, check_forms, combine_detections, quantise
 from gsseg_core.errors import MaskFormatError, SupervisesFileError, UnknownLabelError
-from gsseg_core.files.input_files import check_pixels, is_there, list_folder, open_image
+from gsseg_core.files.input_files import is_there, list_folder, open_image
 from gsseg_core.files.json_files import read_object
 from gsseg_core.files.limits import MAX_LABEL
 from gsseg_core.files.npz_files import NpzArrays, open_arrays
@@ -101,13 +101,13 @@ def read_supervises(
 
 
 def read_soft_mask(
-    path: Path, class_names: Mapping[int, str] | None = None, camera: Camera | None = None, within: Path | None = None
+    path: Path, class_names: Mapping[int, str] | None, camera: Camera, within: Path | None = None
 ) -> SeenLabels:
-    """Read probabilities (.npz) or a folder of detections.
+    """Read probabilities (.npz) or a folder of detections, of the size of a camera's image.
 
-    With `class_names`, an npz without `classes` must have a probability for each id up to the largest. With a camera,
-    the mask must have its size, which is checked before any pixel is read. With `within`, it must lie below that
-    folder, links followed (else `PathNotAllowedError`). Raises `MaskFormatError`, `MaskSizeError` or
+    The size is checked before any pixel is read. With `class_names`, an npz without `classes` must have a probability
+    for each id up to the largest. With `within`, it must lie below that folder, links followed (else
+    `PathNotAllowedError`). Raises `MaskFormatError`, `MaskSizeError` or
     `UnknownLabelError` where it is missing or broken, or not as docs/masks.md says.
     """
     if path.is_dir():
@@ -125,20 +125,18 @@ def read_soft_mask(
     return quantise(probabilities, classes, unknown=unknown, source=str(path))  # type: ignore[arg-type]
 
 
-def _check_claims(path: Path, arrays: NpzArrays, class_names: Mapping[int, str] | None, camera: Camera | None) -> None:
+def _check_claims(path: Path, arrays: NpzArrays, class_names: Mapping[int, str] | None, camera: Camera) -> None:
     """Check what the headers of the arrays say, before any array is read."""
     probabilities = arrays.header("probabilities")
     classes, unknown = (arrays.header(name) if name in arrays.names else None for name in ("classes", _UNKNOWN))
-    shape, size = probabilities.shape, None if camera is None else camera.image_size[::-1]
+    shape, size = probabilities.shape, camera.image_size[::-1]
     if len(shape) == 3 and shape[:2] == size != shape[1:]:
         raise MaskFormatError(
             f"{path}: probabilities are {probabilities}, the classes last; expected (K, H, W), the classes first"
         )
     check_forms(probabilities, classes, unknown, str(path))
     count, height, width = shape
-    if camera is not None:
-        camera.check_mask_size(width, height, str(path), drawn_on_image=True)
-    check_pixels(width, height, str(path), MaskFormatError)
+    camera.check_mask_size(width, height, str(path), drawn_on_image=True)
     if classes is None and class_names is not None and count != max(class_names) + 1:
         raise UnknownLabelError(
             f"{path}: holds probabilities of {count} classes; expected {max(class_names) + 1}, up to the largest id of "
@@ -146,7 +144,7 @@ def _check_claims(path: Path, arrays: NpzArrays, class_names: Mapping[int, str] 
         )
 
 
-def _read_detections(folder: Path, camera: Camera | None, within: Path | None) -> SeenLabels:
+def _read_detections(folder: Path, camera: Camera, within: Path | None) -> SeenLabels:
     detections: dict[int, npt.NDArray[np.generic]] = {}
     unknown = None
     for path in list_folder(folder, MaskFormatError, within):
@@ -169,7 +167,7 @@ def _read_detections(folder: Path, camera: Camera | None, within: Path | None) -
     return combine_detections(detections, unknown=unknown, source=str(folder))
 
 
-def _read_image(path: Path, camera: Camera | None, within: Path | None) -> npt.NDArray[np.float32]:
+def _read_image(path: Path, camera: Camera, within: Path | None) -> npt.NDArray[np.float32]:
     """Read an image of one class, as probabilities (H, W) float32."""
     expected = "probabilities of one class in 8 or 16 bits, or float32"
     with open_image(path, MaskFormatError, "image", expected, ("PNG", "TIFF"), within) as image:
@@ -182,8 +180,7 @@ def _read_image(path: Path, camera: Camera | None, within: Path | None) -> npt.N
                 f"{path}: is a TIFF in which 0 is white, as some write booleans; expected 0 to be black, as in 8 "
                 "bits of 0 and 255"
             )
-        if camera is not None:
-            camera.check_mask_size(*image.size, str(path), drawn_on_image=True)
+        camera.check_mask_size(*image.size, str(path), drawn_on_image=True)
         mode, values = image.mode, np.array(image)
     if mode == "L":
         return values.astype(np.float32) / np.float32(2**8 - 1)

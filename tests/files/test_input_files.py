@@ -44,13 +44,13 @@ READERS: dict[str, Callable[[Path], object]] = {
     "segmentation.npz": lambda path: Segmentation.load(path, SCENE),
     "state.npz": lambda path: State.load(path, SCENE.digest, len(SCENE)),
     "mask.png": read_mask,
-    "mask.npz": read_soft_mask,
+    "mask.npz": lambda path: read_soft_mask(path, None, ring(1)[0]),
     "classes.json": read_classes,
     "cameras.json": lambda path: read_cameras(path.parent),
     "transforms.json": lambda path: read_cameras(path.parent),
     "cameras.bin": lambda path: read_cameras(path.parent.parent),
     "split.json": lambda path: Dataset(path.parent),
-    "view0.tif": lambda path: read_soft_mask(path.parent),
+    "view0.tif": lambda path: read_soft_mask(path.parent, None, ring(1)[0]),
 }
 
 

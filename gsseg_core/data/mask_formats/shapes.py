@@ -18,7 +18,6 @@ import numpy.typing as npt
 from gsseg_core.data.label_images import UNKNOWN
 from gsseg_core.data.mask_formats.rle import runs_to_mask
 from gsseg_core.errors import MaskFormatError, MaskSizeError
-from gsseg_core.files.input_files import check_pixels
 from gsseg_core.files.json_files import kind_of
 from gsseg_core.files.limits import LIMITS, MAX_LABEL
 from gsseg_core.scene.camera import Camera
@@ -208,12 +207,14 @@ class Drawing(NamedTuple):
         Raises `MaskFormatError` where a shape is broken, or there are more shapes than labels, and `MaskSizeError`
         where the image has another shape than the camera's.
         """
-        self._check(camera, where)
+        self._check_count(where)
+        check_fit(self.width, self.height, camera, where)
         return scaled(paint(self.shapes, self.width, self.height), camera)
 
     def nested(self, camera: Camera, where: str) -> Nested:
         """Paint the labels as `paint_nested` does, scaled if need be; raises as `labels` does."""
-        self._check(camera, where)
+        self._check_count(where)
+        check_fit(self.width, self.height, camera, where)
         painted = paint_nested(self.shapes, self.width, self.height)
         return painted._replace(labels=scaled(painted.labels, camera))
 
@@ -221,10 +222,6 @@ class Drawing(NamedTuple):
         """Tell the share of the image that has a shape; raises `MaskFormatError` as `labels` does."""
         self._check_count(where)
         return float((paint(self.shapes, self.width, self.height) > 0).mean())
-
-    def _check(self, camera: Camera, where: str) -> None:
-        self._check_count(where)
-        check_fit(self.width, self.height, camera, where)
 
     def _check_count(self, where: str) -> None:
         if len(self.shapes) > MAX_LABEL:
@@ -275,7 +272,6 @@ def paint_nested(shapes: Sequence[Shape], width: int, height: int) -> Nested:
 
 def check_fit(width: int, height: int, camera: Camera, where: str) -> None:
     """Raise `MaskSizeError` unless a mask has the size of the camera's image, or becomes it by scaling, to a pixel."""
-    check_pixels(width, height, where, MaskFormatError)
     expected = camera.image_size
     scale = (expected[0] * expected[1] / max(width * height, 1)) ** 0.5
     if max(abs(width * scale - expected[0]), abs(height * scale - expected[1])) > 1:
