@@ -6,7 +6,7 @@ gsseg's own masks, a label image, probabilities or detections per view, are not 
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Mapping
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import partial
@@ -37,7 +37,8 @@ class MaskFormat:
     """A format of masks: what messages call it, by what it is recognised, and how it is read.
 
     `recognise` and `read` get the place that `--labels` names. `looked_for` is what marks the format, `ids` what the
-    labels are, and `on_top` what is seen where shapes overlap, all for messages and docs/formats.md.
+    labels are, and `on_top` what is seen where shapes overlap, all for messages and docs/formats.md. `own` finds what
+    in such a place may be gsseg's own masks, among which nobody could tell which are meant.
     """
 
     name: str
@@ -46,6 +47,7 @@ class MaskFormat:
     looked_for: str
     ids: str
     on_top: str
+    own: Callable[[Path, frozenset[str], Path | None], Mapping[str, Path]] = masks_below
 
 
 LABEL_IMAGES = "label images"
@@ -66,7 +68,7 @@ MASK_FORMATS = [
     ),
     MaskFormat(
         "SAM 2 video", is_sam2, read_sam2, "`001/<stem>.png`, a folder for each object",
-        "those of the objects", "the smaller id",
+        "those of the objects", "the smaller id", own=mask_files,  # Its folders are of objects.
     ),
     MaskFormat(
         "LabelMe", is_labelme, partial(read_named, parse=parse_labelme), "`<stem>.json` with `shapes` and `imagePath`",
@@ -90,7 +92,7 @@ MASK_FORMATS = [
     ),
     MaskFormat(
         "EISeg", is_eiseg, read_eiseg, "`<stem>.png` or `<stem>.json`, and `autosave_label.txt`",
-        "those of the labels", "the last polygon",
+        "those of the labels", "the last polygon", own=lambda *_: {},  # It has label images itself.
     ),
 ]  # fmt: skip
 """All formats; a new one is added here."""
@@ -121,8 +123,7 @@ def open_masks(
             return None
         found = [known for known in MASK_FORMATS if known.recognise(place)]
         names = [known.name for known in found]
-        find = mask_files if "SAM 2 video" in names else masks_below  # Its folders are of objects.
-        own = find(path, place.stems, within).values() if found and "EISeg" not in names else ()
+        own = (file for known in found for file in known.own(path, place.stems, within).values())
         if any(_is_own(file, place) for file in own):  # Photos beside annotations are none.
             names.append(LABEL_IMAGES)
         if len(names) > 1:
