@@ -158,17 +158,17 @@ class Dataset:
             that tells its size is `scaled`, if it is.
         """
         views = [view for view in self.views() if view.has_mask]
-        sizes = next(((size, view.camera.image_size) for view in views if (size := view.mask_size)), None)
-        scaled = None if sizes is None or sizes[0] == sizes[1] else sizes
-        if self.masks is None and scaled is None:
+        sizes = next(((size, view.camera.image_size) for view in views if (size := view.mask_size)), ())
+        is_scaled = len(set(sizes)) > 1
+        if self.masks is None and not is_scaled:
             return None
         found = {
             "format": LABEL_IMAGES if self.masks is None else self.masks.format,
             "ids": PER_VIEW if self.masks is not None and self.masks.per_view else GLOBAL,
             "views": len(views),
         }
-        if scaled is not None:
-            found["scaled"] = f"{' to '.join(f'{width} x {height}' for width, height in scaled)} pixels"
+        if is_scaled:
+            found["scaled"] = f"{' to '.join(f'{width} x {height}' for width, height in sizes)} pixels"
         return found
 
     @property
@@ -184,7 +184,7 @@ class Dataset:
     def moved(self, move: Callable[[Camera], Camera]) -> Dataset:
         """Put every camera where `move` says; masks and photos stay what they are."""
         other = copy.copy(self)
-        other._views = {stem: replace(view, camera=move(view.camera)) for stem, view in self._views.items()}
+        other._change_views(lambda view: {"camera": move(view.camera)})
         other.cameras = [view.camera for view in other._views.values()]
         return other
 
@@ -201,11 +201,11 @@ class Dataset:
         declared = None if self._declared is None else names
         other = copy.copy(self)
         other.__dict__["class_names"] = names
-        other._views = {stem: replace(view, class_names=declared, numbering=ids) for stem, view in self._views.items()}
+        other._change_views(lambda view: {"class_names": declared, "numbering": ids})
         return other
 
 
-def _read_split(path: Path, cameras: Sequence[Camera], within: Path | None = None) -> dict[str, list[str]]:
+def _read_split(path: Path, cameras: Sequence[Camera], within: Path | None) -> dict[str, list[str]]:
     """Read `split.json`, stems of images by "train" and "test", as names of views; without it, all are for training.
 
     Raises `SplitFileError` where it is broken, names a view without a camera, or one twice, and `PathNotAllowedError`

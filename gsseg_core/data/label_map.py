@@ -76,13 +76,13 @@ def map_labels(given: Mapping[str, str | None], class_names: Mapping[int, str], 
     """
     renamed: dict[int, str | None] = dict.fromkeys(class_names, given[_OTHERS]) if _OTHERS in given else {}
     # Ids after names, since an id says which of several classes of one name is meant.
-    for key in sorted(given, key=lambda key: id_of(key, class_names) is not None):
+    named = (key for key in given if key != _OTHERS)
+    for key in sorted(named, key=lambda key: id_of(key, class_names) is not None):
         meant = meant_by(key, class_names)
-        if not meant and key != _OTHERS:
+        if not meant:
             known = listed(f"{k} ({name})" for k, name in class_names.items())
             raise LabelMapError(f"{source}: names {quoted(key)}, which the masks do not have; expected some of {known}")
-        if key != _OTHERS:
-            renamed.update(dict.fromkeys(meant, given[key]))
+        renamed.update(dict.fromkeys(meant, given[key]))
     new_ids, names, of_name = {}, {0: BACKGROUND_NAME}, {BACKGROUND_NAME: 0}
     for k, name in class_names.items():  # What stays takes its place before others join it.
         if k not in renamed:

@@ -25,7 +25,6 @@ from gsseg_core.text import clipped, quoted
 if TYPE_CHECKING:
     import pycolmap
 
-_Copy = Callable[[BinaryIO, BinaryIO], None]
 _LEAST_CAMERA = 40  # bytes of a camera in a binary model, of one with two parameters
 _SPACE = "\x1f"  # stands for a space in a name while pycolmap reads it
 
@@ -80,10 +79,7 @@ def _load(path: Path, within: Path | None) -> pycolmap.Reconstruction:
         raise CameraFileError(f"{path}: COLMAP model has {cameras.name} but no {images.name}")
     with _temporary_folder(path) as folder:
         # What was checked is what pycolmap reads, so it gets a copy.
-        copies: list[_Copy] = [_copy_cameras, _copy_images]
-        if suffix == ".txt":
-            copies = [shutil.copyfileobj, _copy_images_of_text]
-        for file, copy in zip((cameras, images), copies, strict=True):
+        for file, copy in zip((cameras, images), _COPIES[suffix], strict=True):
             copied = BytesIO()
             try:
                 with open_expected(file, CameraFileError, within=within) as source:
@@ -164,3 +160,9 @@ def _copy_images_of_text(source: BinaryIO, target: BinaryIO) -> None:
                 )
             line = b" ".join([*pose, name.replace(b" ", _SPACE.encode())]) + b"\n\n"  # of its points, an empty line
         target.write(line)
+
+
+_COPIES: dict[str, tuple[Callable[[BinaryIO, BinaryIO], None], ...]] = {
+    ".bin": (_copy_cameras, _copy_images),
+    ".txt": (shutil.copyfileobj, _copy_images_of_text),
+}
