@@ -41,7 +41,7 @@ Nothing depends on the order of views or ids, nor on how many there are.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
@@ -52,6 +52,7 @@ from gsseg_core.objects.association_kernels import dots_of_pairs
 from gsseg_core.objects.depth_edges import Borders
 from gsseg_core.objects.lifted_segments import Lifted
 from gsseg_core.objects.move_kernels import add_objects, by_view, explain_segments
+from gsseg_core.objects.sight import EVIDENCE, sight
 from gsseg_core.objects.sparse_products import grouping, product_above
 from gsseg_core.objects.stacked_segments import Stack, Voters
 
@@ -63,48 +64,24 @@ _MANY = 0.2  # such share beyond which any two are the likelier one object, the 
 _USUAL, _BORDER = 0.75, 100.0  # strength of depth edges between any two, taken for so many px more of their border
 _SURFACE, _FACTORS = 4.0, (0.75, 1.8)  # by how much agreement grows as edges get weaker, and between what
 _OFTEN = 5  # views in which clusters touch, or that see one, from which on they tell how the segmenter works
-_MANY_VIEWS, _LEAST_DOUBT = 60, 0.3  # views from which on doubt counts in full; its share where they are few
+_DOUBT = 1.0  # views that disagree, added to every pair, ...
+_MANY_VIEWS, _LEAST_DOUBT = 60, 0.3  # ... from so many views on; with fewer in proportion, this at least
+_LEAST_SHARE = 0.5  # of what a view sees of a cluster: an id that has no more does not show it
+_WHOLE_SHARE = 0.9  # an id that has as much shows it whole
+UNSEEN = 0.3  # a segment of which the other views have seen less than this share stays what it is
+_ROUNDS = 10  # of moves, at most
 
 
 @dataclass(frozen=True)
 class AssociationSettings:
     """Settings of `associate`."""
 
-    kept: float = 0.8  # share of a segment's weight that is kept, in its heaviest Gaussians, in (0, 1]
     agreement: float | None = None  # clusters merge above it, in (0, 1); by default, what the views tell
-    doubt: float = 1.0  # views that disagree, added to every pair; with fewer than 60 views in proportion, 0.3 at least
-    evidence: float = 0.3  # views, in full sight of both clusters, that it takes at least to merge two
-    full_sight: float = 0.5  # share of a cluster, as far as any view sees it, that a view must see to count in full
-    plenty: float = 2000.0  # px of a cluster that a view must see to count in full, however large the cluster is
-    full_sight_px: float = 10.0  # what a view sees of a cluster counts by x / (x + this), x in px
-    least_share: float = 0.5  # of what a view sees of a cluster: an id that has no more does not show it
-    whole_share: float = 0.9  # an id that has as much shows it whole
-    unseen: float = 0.3  # a segment of which the other views have seen less than this share stays what it is
-    rounds: int = 10  # of moves, at most
 
     def __post_init__(self) -> None:
         """Validate."""
-        if not 0 < self.kept <= 1:
-            raise SettingsError(f"association: kept is {self.kept}; expected a share in (0, 1]")
         if self.agreement is not None and not 0 < self.agreement < 1:
             raise SettingsError(f"association: agreement is {self.agreement}; expected a share in (0, 1), or None")
-        if not 0 <= self.least_share < self.whole_share <= 1:
-            raise SettingsError(
-                f"association: least_share is {self.least_share}, whole_share {self.whole_share}; expected shares "
-                "in [0, 1], the second the larger one"
-            )
-        for name in ("doubt", "evidence", "full_sight_px", "unseen", "rounds"):
-            if not 0 <= getattr(self, name) < np.inf:
-                raise SettingsError(f"association: {name} is {getattr(self, name)}; expected 0 or more, finite")
-        if not (self.full_sight > 0 and self.plenty > 0):
-            raise SettingsError(
-                f"association: full_sight is {self.full_sight}, plenty {self.plenty}; expected more than 0"
-            )
-
-    def sight(self, seen: np.ndarray, most: np.ndarray) -> np.ndarray:
-        """Say how much views count for what they see of clusters, (C, views) px; the most that any sees is (C, 1)."""
-        full = np.minimum(self.full_sight * most, self.plenty)
-        return np.minimum(seen / np.maximum(full, 1e-9), 1) * seen / (seen + self.full_sight_px)
 
 
 class Association(NamedTuple):
@@ -126,26 +103,25 @@ def associate(views: Mapping[str, Lifted], settings: AssociationSettings | None 
     if not names:
         return Association({}, settings.agreement or _WHOLE)
     stack = Stack([views[name] for name in names])
-    settings = replace(settings, doubt=settings.doubt * np.clip(len(names) / _MANY_VIEWS, _LEAST_DOUBT, 1))
-    clusters, agreement = _merge(stack, settings)
-    objects = _by_size(_move(stack, clusters, settings), stack)
+    clusters, agreement = _merge(stack, settings.agreement)
+    objects = _by_size(_move(stack, clusters), stack)
     return Association(dict(zip(names, np.split(objects, stack.starts[1:-1]), strict=True)), agreement)
 
 
-def _merge(stack: Stack, settings: AssociationSettings) -> tuple[np.ndarray, float]:
-    """Cluster the segments, and say down to which agreement.
+def _merge(stack: Stack, agreement: float | None) -> tuple[np.ndarray, float]:
+    """Cluster the segments, and say down to which agreement, if none is given.
 
     All of the background are cluster 0, the others are numbered from 1.
     """
-    start = _Clusters.single(stack)
-    single = start, _Votes.of(start, np.arange(len(start.seen)), stack.voters, settings)
-    sure = max(settings.agreement or 0, _MOST)
+    start, doubt = _Clusters.single(stack), _DOUBT * np.clip(len(stack.views) / _MANY_VIEWS, _LEAST_DOUBT, 1)
+    single = start, _Votes.of(start, np.arange(len(start.seen)), stack.voters, doubt)
+    sure = max(agreement or 0, _MOST)
     clusters, votes = _merged(*single, stack.voters, sure, surface=0.0)
     doubted = votes.doubted(_touching(stack, clusters))
     split = _in_parts(doubted)
     if split > 0:  # Begun again, so that depth edges count from the first pair on.
         clusters, votes = _merged(*single, stack.voters, sure, surface=split)
-    agreement = settings.agreement or votes.merging_level(doubted)
+    agreement = agreement or votes.merging_level(doubted)
     clusters, _ = _merged(clusters, votes, stack.voters, agreement, surface=split)
     merged = np.zeros(len(stack.view), np.int64)
     merged[~stack.background] = clusters.of + 1
@@ -187,7 +163,7 @@ def _merged(
         unchanged = np.bincount(number) == 1
         changed = np.flatnonzero(~unchanged)
         clusters = clusters.merged(number)
-        votes = votes.replaced(alive[unchanged], changed, _Votes.of(clusters, changed, voters, votes.settings))
+        votes = votes.replaced(alive[unchanged], changed, _Votes.of(clusters, changed, voters, votes.doubt))
         pairs = pairs.among(number, unchanged).and_(votes.pairs(changed, clusters.borders, surface, level))
     return clusters, votes
 
@@ -216,32 +192,32 @@ class _Votes(NamedTuple):
     whole: sparse.csr_matrix  # (C, n + W) float32: how whole each voter shows each, times what its view counts, shared
     counts: np.ndarray  # (C, views): 0 to 1, by how much of a cluster the view sees
     shown: np.ndarray  # (C, views): how whole the view shows it under any id, times counts
-    settings: AssociationSettings
+    doubt: float  # views that disagree, added to every pair
 
     @classmethod
-    def of(cls, clusters: _Clusters, which: np.ndarray, voters: Voters, settings: AssociationSettings) -> _Votes:
+    def of(cls, clusters: _Clusters, which: np.ndarray, voters: Voters, doubt: float) -> _Votes:
         """Let the views vote on some clusters. Who calls a cluster background says nothing of which object it is."""
         seen = clusters.seen[which]
         foreground = np.maximum(seen - clusters.hidden[which], 0)
-        counts = settings.sight(foreground, seen.max(axis=1, keepdims=True, initial=0))
+        counts = sight(foreground, seen.max(axis=1, keepdims=True, initial=0))
         groups, view = grouping(clusters.of)[which], voters.view
-        strong = product_above(groups, clusters.overlap, settings.least_share * foreground, view).tocoo()
+        strong = product_above(groups, clusters.overlap, _LEAST_SHARE * foreground, view).tocoo()
         row, col = strong.row, strong.col
         share = strong.data / np.maximum(foreground[row, view[col]], 1e-9)
-        grown = (share - settings.least_share) / (settings.whole_share - settings.least_share)
+        grown = (share - _LEAST_SHARE) / (_WHOLE_SHARE - _LEAST_SHARE)
         whole = np.minimum(grown, 1) * counts[row, view[col]]
         shown = np.zeros_like(counts)
         np.maximum.at(shown, (row, view[col]), whole)
         shared = whole.astype(np.float32) * voters.share[col]
         rows = sparse.csr_matrix((shared, (row, col)), shape=strong.shape)
-        return cls(rows, counts, shown, settings)
+        return cls(rows, counts, shown, doubt)
 
     def replaced(self, kept: np.ndarray, changed: np.ndarray, by: _Votes) -> _Votes:
         """Keep the rows of some clusters, and put those of others between them: at the places `changed`, ascending."""
         order = np.insert(np.arange(len(kept)), changed - np.arange(len(changed)), len(kept) + np.arange(len(changed)))
         counts, shown = (np.concatenate([old[kept], new])[order] for old, new in zip(self[1:3], by[1:3], strict=True))
         whole = sparse.vstack([self.whole[kept], by.whole], format="csr")[order]
-        return _Votes(whole, counts, shown, self.settings)
+        return _Votes(whole, counts, shown, self.doubt)
 
     def pairs(self, of: np.ndarray, borders: Borders, surface: float, level: float) -> _Pairs:
         """Compare clusters, ascending, with all that any id shows whole together with them; return who agree enough.
@@ -249,7 +225,7 @@ class _Votes(NamedTuple):
         Depth edges count by `surface`, 0 to 1.
         """
         # No fewer views see both, or show each whole, than show both whole together.
-        least = level * self.settings.doubt / ((_FACTORS[1] if surface > 0 else 1) - level)
+        least = level * self.doubt / ((_FACTORS[1] if surface > 0 else 1) - level)
         bar, group = np.full((len(of), 1), least), np.zeros(self.whole.shape[0])
         together = product_above(self.whole[of], self.whole.T.tocsr(), bar, group).tocoo()
         first, second = of[together.row], together.col
@@ -260,15 +236,14 @@ class _Votes(NamedTuple):
         first, second, together = first[once], second[once], together.data[once].astype(np.float64)
         first, second = np.minimum(first, second), np.maximum(first, second)
         see, show = self._views_of_both(first, second)
-        score = np.where(see >= self.settings.evidence, self._agreement(together, see, show), 0)
+        score = np.where(see >= EVIDENCE, self._agreement(together, see, show), 0)
         if surface > 0:
             score *= _surface_factor(borders, first, second) ** surface
         agree = score > level
         return _Pairs(first[agree], second[agree], score[agree])
 
     def _agreement(self, together: np.ndarray, see: np.ndarray, show: np.ndarray) -> np.ndarray:
-        doubt = self.settings.doubt
-        return together / np.sqrt((see + doubt) * (show + doubt))
+        return together / np.sqrt((see + self.doubt) * (show + self.doubt))
 
     def doubted(self, touching: sparse.csr_matrix) -> float:
         """Share of the pairs of clusters that touch, (C, C), that may be parts of one object."""
@@ -329,7 +304,7 @@ def _match(pairs: _Pairs, num: int) -> np.ndarray:
     return target
 
 
-def _move(stack: Stack, objects: np.ndarray, settings: AssociationSettings) -> np.ndarray:
+def _move(stack: Stack, objects: np.ndarray) -> np.ndarray:
     """Give every segment to the object that explains it best by what the other views say.
 
     That ends when none moves any more. Two of which either is explained best by the other would change places for ever:
@@ -338,11 +313,11 @@ def _move(stack: Stack, objects: np.ndarray, settings: AssociationSettings) -> n
     before, weights = objects, stack.weights().T.tocsr()
     by_gaussian = weights.indptr, weights.indices, weights.data
     views = by_view(*by_gaussian, stack.starts, *stack.gaussians())
-    for _ in range(settings.rounds):
+    for _ in range(_ROUNDS):
         earlier, before, num = before, objects, int(objects.max(initial=0)) + 1
         best, known = explain_segments(views, *add_objects(*by_gaussian, before, num), before, num)
         seen = np.divide(known, stack.size, out=np.zeros_like(known), where=stack.size > 0)
-        moves = ~stack.background & (seen >= settings.unseen)
+        moves = ~stack.background & (seen >= UNSEEN)
         size = np.bincount(before, stack.size, num)
         stays = (best == earlier) & (size[best] < size[before])
         objects = np.where(moves & ~stays, best, before)

@@ -17,6 +17,8 @@ from gsseg_core.raster.observation import LabelWeights
 from gsseg_core.raster.view_operator import ViewOperator
 from gsseg_core.scene.gaussian_scene import GaussianScene
 
+KEPT = 0.8  # share of a segment's weight that is kept, in its heaviest Gaussians
+
 
 @dataclass(frozen=True, eq=False)
 class Lifted:
@@ -29,7 +31,7 @@ class Lifted:
     wholes: np.ndarray | None = None  # (L,) int32: by segment, the id of the whole that it is a part of in its mask
 
     @classmethod
-    def of(cls, seen: LabelWeights, kept: float = 0.8) -> Lifted:
+    def of(cls, seen: LabelWeights, kept: float = KEPT) -> Lifted:
         """Lift the ids of a mask; of each, only the heaviest Gaussians that make up a share of its weight."""
         size, heavy = heaviest(seen.start, seen.weights, kept)
         ids, weights = seen.gaussians[heavy], seen.weights[heavy]
@@ -75,12 +77,12 @@ class Profiles:
         return cls(sparse.csr_matrix((num_gaussians, 1)))
 
     @classmethod
-    def of(cls, votes: CSRRows, kept: float) -> Profiles:
+    def of(cls, votes: CSRRows) -> Profiles:
         """Make those of votes for objects, in px; of each, only the heaviest Gaussians, as `Lifted.of` does."""
         shape = votes.num_rows, int(votes.indices.max(initial=0)) + 1
         px = np.maximum(votes.data, 0).astype(np.float32)
         weights = sparse.csr_matrix((px, votes.indices.astype(np.int64), votes.indptr), shape=shape).tocsc()
-        weights.data *= heaviest(weights.indptr.astype(np.int64), weights.data, kept)[1]
+        weights.data *= heaviest(weights.indptr.astype(np.int64), weights.data, KEPT)[1]
         weights.eliminate_zeros()
         return cls(weights.tocsr())
 

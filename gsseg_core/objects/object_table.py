@@ -15,8 +15,9 @@ from gsseg_core.data.view import View
 from gsseg_core.errors import SceneValueError, SettingsError, UnknownLabelError
 from gsseg_core.files.limits import MAX_LABEL
 from gsseg_core.learn.all_or_nothing import Undo, all_or_nothing, checkpoint
-from gsseg_core.objects.association import AssociationSettings, associate
+from gsseg_core.objects.association import UNSEEN, AssociationSettings, associate
 from gsseg_core.objects.lifted_segments import Lifted, Profiles
+from gsseg_core.objects.sight import FULL_SIGHT_PX
 from gsseg_core.objects.sparse_products import sums
 from gsseg_core.objects.tree_growing import grow_tree
 from gsseg_core.progress import Progress, silent
@@ -101,7 +102,7 @@ class ObjectTable:
                 return _without_labels(view)
             lifted = self._lifted[view.name]
             best, seen = self._profiles.explain(lifted)
-            new = (lifted.ids > 0) & (seen < self.settings.unseen)
+            new = (lifted.ids > 0) & (seen < UNSEEN)
             best[lifted.ids == 0] = 0
             best[new] = self._largest + 1 + np.arange(np.count_nonzero(new))
             if best.max(initial=0) > MAX_LABEL:
@@ -123,7 +124,7 @@ class ObjectTable:
         observation = operator.observe(labels)
         if not observation.num_pairs:
             return None
-        self._add(view, Lifted.of(observation.by_label(), self.settings.kept).bordered(self.scene, operator, labels))
+        self._add(view, Lifted.of(observation.by_label()).bordered(self.scene, operator, labels))
         self._give(view.name, self._lifted[view.name].ids)
         return observation
 
@@ -146,7 +147,7 @@ class ObjectTable:
             shape = votes.num_rows, int(votes.indices.max(initial=0)) + 1
             found = f"votes have shape {shape}, {votes.data.min(initial=0)} to {votes.data.max(initial=0)}"
             raise SceneValueError(f"objects: {found}; expected ({len(self.scene)}, K), finite")
-        self._forgotten = Profiles.of(votes, self.settings.kept)
+        self._forgotten = Profiles.of(votes)
         self._fill()
 
     def remove(self, name: str) -> None:
@@ -205,7 +206,7 @@ class ObjectTable:
         labels, likely = segmentation.labels, np.maximum(largest(segmentation.shares)[1], 0)
         classes = np.where(labels == REMOVED, likely, labels)  # What was removed covers an object still.
         level = _EARLY_GRANULARITY if self._agreement is None else self._agreement
-        tree = grow_tree(self.scene.means, classes, len(segmentation.class_names), self._lifted, level, self.settings)
+        tree = grow_tree(self.scene.means, classes, len(segmentation.class_names), self._lifted, level)
         return replace(segmentation, tree=tree)
 
     def relabelled(self, view: View) -> View:
@@ -237,7 +238,7 @@ class ObjectTable:
         parts[:, 0], parts[lifted.ids == 0] = 0, 0
         size = parts.sum(axis=0)
         # Most of an object, as far as this view shows it, lies under an id: more than one, and the id has merged them.
-        most = (parts > 0.5 * size) & (size >= self.settings.full_sight_px)
+        most = (parts > 0.5 * size) & (size >= FULL_SIGHT_PX)
         return ViewObjects(
             dict(sorted(zip(lifted.ids.tolist(), objects.tolist(), strict=True))),
             merged=int((most.sum(axis=1) > 1).sum()),
@@ -279,7 +280,7 @@ class ObjectTable:
         seen = operator.lift(labels)
         if not len(seen.gaussians):
             return None
-        lifted = Lifted.of(seen, self.settings.kept).bordered(self.scene, operator, labels)
+        lifted = Lifted.of(seen).bordered(self.scene, operator, labels)
         return lifted if outermost is None else replace(lifted, wholes=outermost[lifted.ids])
 
     def _open(

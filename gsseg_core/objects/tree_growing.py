@@ -28,17 +28,16 @@ import numpy as np
 from scipy import sparse
 
 from gsseg_core.data.object_tree import ObjectTree
-from gsseg_core.objects.association import AssociationSettings
 from gsseg_core.objects.lifted_segments import Lifted
+from gsseg_core.objects.sight import FULL_SIGHT_PX
 from gsseg_core.objects.sparse_products import grouping, sums
-from gsseg_core.objects.tree_kernels import Merged, Sight, cells, merge_regions, showing, staying
+from gsseg_core.objects.tree_kernels import Merged, cells, merge_regions, showing, staying
 from gsseg_core.spatial.row_order import rows_by_label
 
 SEVERAL = 3  # views that have to show a part or a whole
 _CELL, _MOST_CELLS = 8, 256  # Gaussians of a cell; cells of an object, of which a larger one has larger cells
 _ITSELF = 0.5  # IoU above which a segment is a region: it can be so of no other one beside it
 _STEPS = 10  # agreements are told apart by a tenth
-_DOUBT = 0.3  # in place of that of the settings: where views are few, too, agreement is the share of them
 
 
 @dataclass(eq=False)
@@ -65,12 +64,9 @@ def grow_tree(
     num_classes: int,  # largest object that there may be, and one more for the background
     views: Mapping[str, Lifted],  # in any order; the names only break ties
     level: float,  # agreement down to which segments were put together, the granularity of the objects
-    settings: AssociationSettings | None = None,  # what of a view counts how much; `doubt` is the tree's own
 ) -> ObjectTree:
     """Find the parts of objects, and the wholes that they make."""
-    given = settings or AssociationSettings()
-    sight = Sight(_DOUBT, *(float(getattr(given, name)) for name in Sight._fields[1:]))
-    weights, segments = _stacked(views, len(means), sight)
+    weights, segments = _stacked(views, len(means))
     objects = [_Region(row=k) for k in range(num_classes)]
     places = np.where(classes >= 0, 0, -1)  # among the leaves of its object
     of_class, nobody = rows_by_label(classes), np.zeros(0, np.int64)
@@ -100,11 +96,10 @@ class _Segments:
 
     view: np.ndarray  # (S,): ascending
     size: np.ndarray  # (S,), px
-    sight: Sight
 
     def among(self, used: np.ndarray) -> _Segments:  # (S',)
         """Take some of them, of views without gaps."""
-        return _Segments(np.unique(self.view[used], return_inverse=True)[1], self.size[used], self.sight)
+        return _Segments(np.unique(self.view[used], return_inverse=True)[1], self.size[used])
 
     def seen(self, regions: np.ndarray) -> np.ndarray:
         """Sum up what each view sees of regions (R, S), in px, (R, views)."""
@@ -114,16 +109,14 @@ class _Segments:
     def merged(self, rows: sparse.csr_matrix, groups: np.ndarray) -> Merged:
         """Merge the regions that groups (n,) of Gaussians are, by rows (n, S): all on the way, parts before wholes."""
         shares = (grouping(groups) @ rows.astype(np.float64)).toarray()
-        return merge_regions(shares, self.view, self.sight)
+        return merge_regions(shares, self.view)
 
     def showing(self, merged: Merged) -> np.ndarray:
         """Which views show each region as a segment, (R, views) bool."""
-        return showing(merged.parts, merged.shares, self.view, self.size, _ITSELF, self.sight.full_sight_px)
+        return showing(merged.parts, merged.shares, self.view, self.size, _ITSELF, FULL_SIGHT_PX)
 
 
-def _stacked(
-    views: Mapping[str, Lifted], num_gaussians: int, sight: Sight
-) -> tuple[sparse.csr_matrix, _Segments]:  # (N, S), px
+def _stacked(views: Mapping[str, Lifted], num_gaussians: int) -> tuple[sparse.csr_matrix, _Segments]:  # (N, S), px
     """Stack the segments of all views but their backgrounds, and the wholes of several."""
     blocks = [sparse.csr_matrix((0, num_gaussians), dtype=np.float32)]
     for name in sorted(views):
@@ -132,7 +125,7 @@ def _stacked(
         blocks += [every[one.ids != 0], one.wholes_of_several() @ every]
     stacked = sparse.vstack(blocks, format="csr")
     view = np.repeat(np.arange(len(blocks)), [block.shape[0] for block in blocks])
-    every = _Segments(view, sums(stacked, 1), sight)
+    every = _Segments(view, sums(stacked, 1))
     return stacked.T.tocsr(), every.among(np.arange(len(view)))
 
 

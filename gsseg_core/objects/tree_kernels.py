@@ -10,16 +10,9 @@ from typing import NamedTuple
 import numpy as np
 
 from gsseg_core.kernels.compiler import called_by_kernels, kernel
+from gsseg_core.objects.sight import EVIDENCE, FULL_SIGHT, FULL_SIGHT_PX, PLENTY
 
-
-class Sight(NamedTuple):
-    """Those of `AssociationSettings` that say how much a view counts for what it sees, and what it takes to agree."""
-
-    doubt: float
-    evidence: float
-    full_sight: float
-    plenty: float
-    full_sight_px: float
+DOUBT = 0.3  # views that disagree, added to every pair of regions: where views are few, agreement is the share of them
 
 
 class Merged(NamedTuple):
@@ -31,7 +24,7 @@ class Merged(NamedTuple):
 
 
 @kernel(error_model="numpy")
-def merge_regions(shares: np.ndarray, view: np.ndarray, sight: Sight) -> Merged:  # (r, S) float64, (S,) int64
+def merge_regions(shares: np.ndarray, view: np.ndarray) -> Merged:  # (r, S) float64, (S,) int64
     """Merge regions, in every round those that agree with each other more than with any third."""
     num, ids = shares.shape
     room = max(2 * num, 1)
@@ -43,8 +36,8 @@ def merge_regions(shares: np.ndarray, view: np.ndarray, sight: Sight) -> Merged:
     votes, counts, agreed = np.zeros((ids, num)), np.zeros((num_views, num)), np.zeros((num, num))
     own, own_counts, first, best = np.empty(ids), np.empty(num_views), np.empty(num, np.int64), np.empty(num, np.int64)
     for p in range(num):
-        _vote(every[p], view, sight, own, own_counts)
-        _agree(own, own_counts, votes, counts, left, sight, agreed[p, :p])
+        _vote(every[p], view, own, own_counts)
+        _agree(own, own_counts, votes, counts, left, agreed[p, :p])
         agreed[:p, p] = agreed[p, :p]
         votes[:, p], counts[:, p] = own, own_counts
     while True:
@@ -72,17 +65,17 @@ def merge_regions(shares: np.ndarray, view: np.ndarray, sight: Sight) -> Merged:
             every[total] = every[region[p]] + every[region[b]]
             region[p], left[b], total = total, False, total + 1
             votes[:, b], counts[:, b], agreed[b, :width], agreed[:width, b] = 0, 0, 0, 0
-            _vote(every[region[p]], view, sight, own, own_counts)
+            _vote(every[region[p]], view, own, own_counts)
             votes[:, p], counts[:, p] = own, own_counts
         for p in first[:many]:
-            _vote(every[region[p]], view, sight, own, own_counts)
-            _agree(own, own_counts, votes, counts, left, sight, agreed[p, :width])
+            _vote(every[region[p]], view, own, own_counts)
+            _agree(own, own_counts, votes, counts, left, agreed[p, :width])
             agreed[p, p] = 0
             agreed[:width, p] = agreed[p, :width]
 
 
 @called_by_kernels(error_model="numpy")
-def _vote(shares: np.ndarray, view: np.ndarray, sight: Sight, votes: np.ndarray, counts: np.ndarray) -> None:
+def _vote(shares: np.ndarray, view: np.ndarray, votes: np.ndarray, counts: np.ndarray) -> None:
     """Write how far each view counts for a region, and the shares that its ids have as far as it does."""
     counts[:] = 0
     for s in range(len(shares)):
@@ -90,12 +83,12 @@ def _vote(shares: np.ndarray, view: np.ndarray, sight: Sight, votes: np.ndarray,
     most = 0.0
     for seen in counts:
         most = max(most, seen)
-    full = max(min(sight.full_sight * most, sight.plenty), 1e-9)
+    full = max(min(FULL_SIGHT * most, PLENTY), 1e-9)
     votes[:] = shares
     s = 0
     for v in range(len(counts)):
         seen = counts[v]
-        counts[v] = min(seen / full, 1.0) * seen / (seen + sight.full_sight_px)
+        counts[v] = min(seen / full, 1.0) * seen / (seen + FULL_SIGHT_PX)
         factor = counts[v] / max(seen, 1e-9)
         while s < len(shares) and view[s] == v:
             votes[s] *= factor
@@ -104,7 +97,7 @@ def _vote(shares: np.ndarray, view: np.ndarray, sight: Sight, votes: np.ndarray,
 
 @called_by_kernels(error_model="numpy")
 def _agree(
-    own: np.ndarray, own_counts: np.ndarray, votes: np.ndarray, counts: np.ndarray, left: np.ndarray, sight: Sight,
+    own: np.ndarray, own_counts: np.ndarray, votes: np.ndarray, counts: np.ndarray, left: np.ndarray,
     agreed: np.ndarray,
 ) -> None:  # fmt: skip
     """Write how far a region agrees with those in the first places."""
@@ -120,7 +113,7 @@ def _agree(
             for r in range(width):
                 agreed[r] += own[s] * votes[s, r]
     for r in range(width):
-        agreed[r] = agreed[r] / (both[r] + sight.doubt) if left[r] and both[r] >= sight.evidence else 0.0
+        agreed[r] = agreed[r] / (both[r] + DOUBT) if left[r] and both[r] >= EVIDENCE else 0.0
 
 
 @kernel(error_model="numpy")
@@ -203,6 +196,6 @@ def cells(points: np.ndarray, size: float) -> np.ndarray:  # (n, 3) float32
 def call_all() -> None:
     """Call each kernel with arrays of the types that the tree has for it, so that it is compiled."""
     view = np.zeros(1, np.int64)
-    merged = merge_regions(np.ones((2, 1)), view, Sight(0.3, 0.3, 0.5, 2000.0, 10.0))
+    merged = merge_regions(np.ones((2, 1)), view)
     staying(merged.parts, showing(merged.parts, merged.shares, view, np.ones(1), 0.5, 10.0), 0, 3)
     cells(np.zeros((2, 3), np.float32), 1.0)

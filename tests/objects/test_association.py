@@ -361,7 +361,9 @@ def test_ari_and_matchings_are_those_of_the_definition() -> None:
     assert renamed(np.array([5, 7, UNKNOWN]), {5: 0}).tolist() == [0, UNKNOWN, UNKNOWN]
 
 
-def test_views_of_a_corner_of_something_large_say_that_what_is_beside_it_is_another_thing() -> None:
+def test_views_of_a_corner_of_something_large_say_that_what_is_beside_it_is_another_thing(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     """A view from afar calls both one; five from close by, which see little of the large one, tell them apart."""
 
     def lifted(rows: list[list[float]]) -> Lifted:
@@ -375,16 +377,15 @@ def test_views_of_a_corner_of_something_large_say_that_what_is_beside_it_is_anot
     large, small = objects["close 0"]
     assert large != small and objects["afar"].tolist() == [large]
     assert all(objects[name].tolist() == [large, small] for name in views if name != "afar")
-    one = associate(views, AssociationSettings(plenty=np.inf)).objects
+    monkeypatch.setattr("gsseg_core.objects.sight.PLENTY", np.inf)
+    one = associate(views).objects
     assert len(set(np.concatenate(list(one.values())).tolist())) == 1
 
 
-def test_settings_that_make_no_sense_are_refused() -> None:
-    senseless = {"kept": 0.0}, {"agreement": 1.0}, {"doubt": -1.0}, {"full_sight": 0.0}, {"least_share": 0.9}
-    no_numbers = ({name: np.nan} for name in ("doubt", "rounds", "full_sight", "plenty"))
-    for wrong in (*senseless, {"plenty": 0.0}, *no_numbers):
-        with pytest.raises(SettingsError, match="association"):
-            AssociationSettings(**wrong)
+@pytest.mark.parametrize("agreement", [0.0, 1.0, -0.1, np.nan])
+def test_settings_that_make_no_sense_are_refused(agreement: float) -> None:
+    with pytest.raises(SettingsError, match="association"):
+        AssociationSettings(agreement)
 
 
 def test_the_benchmark_splits_and_merges_objects_as_often_as_it_says() -> None:

@@ -12,13 +12,13 @@ from per_view_ids import row_of_objects
 from scipy import sparse
 
 from gsseg_core.objects import association
-from gsseg_core.objects.association import AssociationSettings, associate
+from gsseg_core.objects.association import associate
 from gsseg_core.objects.lifted_segments import Lifted, Profiles
 from gsseg_core.objects.move_kernels import add_objects, by_view, explain_segments
 from gsseg_core.objects.sparse_products import product_above
 from gsseg_core.objects.stacked_segments import Stack, Voters
 
-SETTINGS = AssociationSettings()
+DOUBT = 1.0
 WEIGHTS = sparse.csr_matrix(np.full((1, 2), 4, np.float32))
 
 
@@ -84,7 +84,7 @@ def merged_by_comparing_all_anew(
     """The twin of `_merged`."""
     while True:
         every = np.arange(len(clusters.seen))
-        votes = association._Votes.of(clusters, every, voters, SETTINGS)
+        votes = association._Votes.of(clusters, every, voters, DOUBT)
         pairs = votes.pairs(every, clusters.borders, surface, level)
         if not len(pairs.first):
             return clusters, votes
@@ -97,7 +97,7 @@ def merged_by_comparing_all_anew(
 def test_comparing_only_what_has_merged_gives_what_comparing_all_gives(seed: int, surface: float) -> None:
     stack = Stack(drawn_views(seed, 9, seed % 2 == 0))
     start = association._Clusters.single(stack)
-    votes = association._Votes.of(start, np.arange(len(start.seen)), stack.voters, SETTINGS)
+    votes = association._Votes.of(start, np.arange(len(start.seen)), stack.voters, DOUBT)
     for level in (0.6, 0.3):
         found, found_votes = association._merged(start, votes, stack.voters, level, surface)
         twin, twin_votes = merged_by_comparing_all_anew(start, votes, stack.voters, level, surface)

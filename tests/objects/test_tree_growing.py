@@ -25,16 +25,15 @@ from gsseg_core.learn.vote_learner import VoteLearner
 from gsseg_core.objects.association import AssociationSettings
 from gsseg_core.objects.lifted_segments import Lifted
 from gsseg_core.objects.object_table import ObjectTable, find_objects, object_name
+from gsseg_core.objects.sight import EVIDENCE, FULL_SIGHT_PX, sight
 from gsseg_core.objects.tree_growing import SEVERAL, _kept, _Region, _Segments, grow_tree
-from gsseg_core.objects.tree_kernels import Merged, Sight, cells
+from gsseg_core.objects.tree_kernels import DOUBT, Merged, cells
 from gsseg_core.raster.backends import make_operator
 from gsseg_core.refine.settings import UNREFINED
 from gsseg_core.scene.gaussian_scene import GaussianScene
 from gsseg_core.segmentation import Segmentation
 
 VIEWS = clean_views(12)
-SETTINGS = AssociationSettings()
-SIGHT = Sight(*(float(getattr(SETTINGS, name)) for name in Sight._fields))
 
 
 def grown(views: Sequence[View], level: float = 0.4) -> ObjectTree:
@@ -45,7 +44,7 @@ def grown(views: Sequence[View], level: float = 0.4) -> ObjectTree:
 def votes_of(regions: np.ndarray, segments: _Segments) -> tuple[np.ndarray, np.ndarray]:
     """Shares of regions (R, S) that each view's ids have, as far as the view counts, and how far, (R, views)."""
     seen = segments.seen(regions)
-    counts = SETTINGS.sight(seen, seen.max(axis=1, keepdims=True, initial=0))
+    counts = sight(seen, seen.max(axis=1, keepdims=True, initial=0))
     return regions * (counts / np.maximum(seen, 1e-9))[:, segments.view], counts
 
 
@@ -55,8 +54,8 @@ def merged_slowly(shares: np.ndarray, segments: _Segments) -> tuple[list[tuple[i
     while True:
         votes, counts = votes_of(np.array([every[region] for region in left]), segments)
         both = sparse.csr_matrix(counts) @ counts.T
-        agreed = sparse.csr_matrix(votes) @ votes.T / (both + SETTINGS.doubt)
-        agreed[both < SETTINGS.evidence] = 0
+        agreed = sparse.csr_matrix(votes) @ votes.T / (both + DOUBT)
+        agreed[both < EVIDENCE] = 0
         np.fill_diagonal(agreed, 0)
         best = agreed.argmax(axis=1).tolist()
         pairs = [(a, b) for a, b in enumerate(best) if b > a and best[b] == a and agreed[a, b] > 0]
@@ -77,7 +76,7 @@ def test_regions_merge_bit_for_bit_as_when_all_pairs_are_measured_in_every_round
     rng = np.random.default_rng(seed)
     view = np.repeat(np.arange(views), ids)
     shares = rng.integers(0, 60, (count, len(view))) * (rng.random((count, len(view))) < 2 / ids) * 1.0
-    segments = _Segments(view, shares.sum(axis=0), SIGHT)
+    segments = _Segments(view, shares.sum(axis=0))
     merged = segments.merged(sparse.csr_matrix(shares), np.arange(count))
     merges, expected = merged_slowly(shares, segments)
     assert [(*two, by) for two, by in zip(merged.parts.tolist(), merged.agreement.tolist(), strict=True)][
@@ -97,7 +96,7 @@ def shown_slowly(merged: Merged, segments: _Segments) -> np.ndarray:
             fits[part] &= iou[part] > iou[region]
             fits[region] &= iou[region] >= iou[part]
     of_view = segments.view == np.arange(seen.shape[1])[:, None]
-    return (fits[:, None] & of_view).any(axis=2) & (seen >= SETTINGS.full_sight_px)
+    return (fits[:, None] & of_view).any(axis=2) & (seen >= FULL_SIGHT_PX)
 
 
 def kept_slowly(merged: Merged, shown: np.ndarray, objects: Sequence[_Region]) -> list[_Region]:
@@ -131,7 +130,7 @@ def test_regions_that_are_shown_and_kept_are_those_of_the_slow_twins(
     view = np.repeat(np.arange(views), ids)
     owner = rng.integers(0, ids, (count, views))
     shares = (owner[:, :, None] == np.arange(ids)).reshape(count, -1) * rng.integers(1, 60, (count, len(view))) * 1.0
-    segments = _Segments(view, shares.sum(axis=0), SIGHT)
+    segments = _Segments(view, shares.sum(axis=0))
     merged = segments.merged(sparse.csr_matrix(shares), np.arange(count))
     shown = segments.showing(merged)
     np.testing.assert_array_equal(shown, shown_slowly(merged, segments))
