@@ -8,7 +8,6 @@ import threading
 import webbrowser
 from contextlib import closing, suppress
 from pathlib import Path
-from types import ModuleType
 from typing import TYPE_CHECKING
 
 from gsseg_core.cli.shared import add_device, add_frame, add_quiet, load_kernels, note_frame, placed
@@ -22,6 +21,7 @@ if TYPE_CHECKING:
     from gsseg_core.segmentation import Segmentation
     from gsseg_core.viewer.access import Listener
     from gsseg_core.viewer.learnt_views import LearntFrom
+    from gsseg_core.viewer.viewer import Viewer
 
 DESCRIPTION = """
 Serves a page in which the scene is drawn in true colours, by class or by confidence; classes can be shown alone,
@@ -53,16 +53,21 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(options: argparse.Namespace) -> int:
     """Show the scene until interrupted."""
-    viewer_module = load_viewer()
+    try:
+        from gsseg_core.viewer.viewer import Viewer
+    except ModuleNotFoundError as missing:
+        if missing.name != "viser":
+            raise
+        raise SettingsError("`gsseg view` needs viser, which is missing: pip install 'gsseg[view]'") from missing
     from gsseg_core.viewer.access import listen
 
     if options.ros and options.segmentation:
         raise SettingsError("both --ros and --segmentation are given; expected one: the node has codes of its own")
     with closing(listen(options.host, options.port)) as listener:
-        return _show(options, listener, viewer_module)
+        return _show(options, listener, Viewer)
 
 
-def _show(options: argparse.Namespace, listener: Listener, viewer_module: ModuleType) -> int:
+def _show(options: argparse.Namespace, listener: Listener, make: type[Viewer]) -> int:
     from gsseg_core.scene.gaussian_scene import GaussianScene
     from gsseg_core.segmentation import Segmentation
     from gsseg_core.viewer.learnt_views import LearntFrom
@@ -89,9 +94,7 @@ def _show(options: argparse.Namespace, listener: Listener, viewer_module: Module
     mode = BY_CLASS if options.segmentation or options.ros else TRUE_COLOURS
     tree = read.tree if read else None  # A node tells labels alone.
     model = ViewModel(scene, labelling, mode=mode, class_ids=tuple(class_ids), tree=tree, read=read)
-    viewer = viewer_module.Viewer(
-        model, views, learnt.reliability, source, listener=listener, draw=options.draw, device=options.device
-    )
+    viewer = make(model, views, learnt.reliability, source, listener=listener, draw=options.draw, device=options.device)
     with closing(viewer), suppress(KeyboardInterrupt):  # How it is meant to end.
         tell(f"gsseg: {counted(len(scene), 'Gaussian')} at {viewer.url} (Ctrl-C ends it)")
         if listener.everywhere:
@@ -120,14 +123,3 @@ def _views(
         return views
     note(f"there are no views to jump to: {why}")
     return []
-
-
-def load_viewer() -> ModuleType:
-    """Import the viewer; `SettingsError` if viser is not installed."""
-    try:
-        from gsseg_core.viewer import viewer
-    except ModuleNotFoundError as missing:
-        if missing.name != "viser":
-            raise
-        raise SettingsError("`gsseg view` needs viser, which is missing: pip install 'gsseg[view]'") from missing
-    return viewer

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
-from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -12,7 +11,6 @@ import pytest
 from per_view_ids import shuffled
 from small_scenes import balls_on_a_table, write_dataset
 
-from gsseg_core.cli import view as command
 from gsseg_core.cli.main import main
 from gsseg_core.data.dataset import Dataset
 from gsseg_core.data.label_images import UNKNOWN, write_mask
@@ -50,7 +48,7 @@ def shown_views(data: Path, monkeypatch: pytest.MonkeyPatch, *options: str) -> l
         def url(self) -> str:
             raise KeyboardInterrupt
 
-    monkeypatch.setattr(command, "load_viewer", lambda: SimpleNamespace(Viewer=Viewer))
+    monkeypatch.setattr("gsseg_core.viewer.viewer.Viewer", Viewer)
     assert main(["view", str(data / "scene.ply"), "--data", str(data), "--quiet", *options]) == 0
     return given
 
