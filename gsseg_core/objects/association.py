@@ -64,8 +64,7 @@ _MANY = 0.2  # such share beyond which any two are the likelier one object, the 
 _USUAL, _BORDER = 0.75, 100.0  # strength of depth edges between any two, taken for so many px more of their border
 _SURFACE, _FACTORS = 4.0, (0.75, 1.8)  # by how much agreement grows as edges get weaker, and between what
 _OFTEN = 5  # views in which clusters touch, or that see one, from which on they tell how the segmenter works
-_DOUBT = 1.0  # views that disagree, added to every pair, ...
-_MANY_VIEWS, _LEAST_DOUBT = 60, 0.3  # ... from so many views on; with fewer in proportion, this at least
+_MANY_VIEWS, _LEAST_DOUBT = 60, 0.3  # views from which on one that disagrees is added; the share of one at least
 _LEAST_SHARE = 0.5  # of what a view sees of a cluster: an id that has no more does not show it
 _WHOLE_SHARE = 0.9  # an id that has as much shows it whole
 UNSEEN = 0.3  # a segment of which the other views have seen less than this share stays what it is
@@ -113,7 +112,7 @@ def _merge(stack: Stack, agreement: float | None) -> tuple[np.ndarray, float]:
 
     All of the background are cluster 0, the others are numbered from 1.
     """
-    start, doubt = _Clusters.single(stack), _DOUBT * np.clip(len(stack.views) / _MANY_VIEWS, _LEAST_DOUBT, 1)
+    start, doubt = _Clusters.single(stack), np.clip(len(stack.views) / _MANY_VIEWS, _LEAST_DOUBT, 1)
     single = start, _Votes.of(start, np.arange(len(start.seen)), stack.voters, doubt)
     sure = max(agreement or 0, _MOST)
     clusters, votes = _merged(*single, stack.voters, sure, surface=0.0)

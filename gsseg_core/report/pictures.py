@@ -5,7 +5,6 @@ from __future__ import annotations
 import base64
 from collections.abc import Iterable
 from io import BytesIO
-from typing import NamedTuple
 
 import numpy as np
 from PIL import Image
@@ -29,14 +28,6 @@ CUT = 0.3  # what a view in which the margin cuts an object counts, beside one t
 MOST_KEPT = 32  # images that are kept once they were rendered: thumbnails may need hundreds, each once
 UNSEEN = 0.5  # what a view counts whose image would have to be rendered, beside one whose image is at hand
 _AGREE, _DIFFER, _UNKNOWN = (40, 44, 52), (236, 72, 60), FAINT_INK
-
-
-class Triple(NamedTuple):
-    """A view three times, each (H, W, 3) uint8: under its mask, under the prediction, and where the two differ."""
-
-    mask: np.ndarray
-    prediction: np.ndarray
-    difference: np.ndarray
 
 
 class ViewImages:
@@ -71,10 +62,10 @@ class ViewImages:
         return image
 
 
-def draw_triple(check: ViewCheck, view: View, images: ViewImages, colors: np.ndarray) -> Triple:
-    """Lay a view's mask and what is predicted over its image, in colours (K, 3) of classes; show where they differ.
+def draw_triple(check: ViewCheck, view: View, images: ViewImages, colors: np.ndarray) -> tuple[np.ndarray, ...]:
+    """Lay a view's mask over its image, and what is predicted, in colours (K, 3) of classes; show where they differ.
 
-    Large ones are thinned out, to be shown with at most `PICTURE_PX` px a side.
+    Returns these three, (H, W, 3) uint8. Large ones are thinned out, to be shown with at most `PICTURE_PX` px a side.
     """
     image, mask, predicted = shown_at(PICTURE_PX, images.of(view), view.read_labels(), check.prediction())
     # There are three tints, and 766 greys to lay them over.
@@ -82,7 +73,7 @@ def draw_triple(check: ViewCheck, view: View, images: ViewImages, colors: np.nda
     table = ((1 - strength) * (np.arange(3 * 255 + 1) / 3)[:, None] + strength * tints).round().astype(np.uint8)
     which = np.where((mask == UNKNOWN) | (predicted == UNKNOWN), 2, mask != predicted)
     difference = table[which, image[..., 0].astype(np.int16) + image[..., 1] + image[..., 2]]
-    return Triple(overlay(image, mask, colors), overlay(image, predicted, colors), difference)
+    return overlay(image, mask, colors), overlay(image, predicted, colors), difference
 
 
 def thumbnails(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from typing import NamedTuple
 
@@ -30,10 +31,10 @@ def disc(camera: Camera, column: float, row: float, radius: float, label: int) -
     At least the pixel of the middle is drawn. Raises `SettingsError` where that is not in the picture, or the label is
     no class.
     """
-    _check_inside(camera, column, row)
+    middle = _pixel(camera, column, row)
     x, y = np.arange(camera.width) + 0.5, np.arange(camera.height)[:, None] + 0.5
     drawn = (x - column) ** 2 + (y - row) ** 2 <= radius**2
-    drawn[int(row), int(column)] = True
+    drawn[middle] = True
     return _view(camera, drawn, label)
 
 
@@ -46,9 +47,9 @@ def box(camera: Camera, corner: Sequence[float], opposite: Sequence[float], labe
 
 def region(camera: Camera, label_map: np.ndarray, column: float, row: float, label: int) -> View:
     """Draw the connected region of one label of a map (H, W) around a pixel, as it is shown now; see `disc`."""
-    _check_inside(camera, column, row)
-    parts, _ = ndimage.label(label_map == label_map[int(row), int(column)])
-    return _view(camera, parts == parts[int(row), int(column)], label)
+    clicked = _pixel(camera, column, row)
+    parts, _ = ndimage.label(label_map == label_map[clicked])
+    return _view(camera, parts == parts[clicked], label)
 
 
 def looks_alike(
@@ -58,8 +59,7 @@ def looks_alike(
 
     Also raises `NoUsableViewsError` where the pixel shows no Gaussian.
     """
-    _check_inside(camera, column, row)
-    return _view(camera, click_labels(scene, camera, [(int(row), int(column))], device=device) == 1, label)
+    return _view(camera, click_labels(scene, camera, [_pixel(camera, column, row)], device=device) == 1, label)
 
 
 class Drawn(NamedTuple):
@@ -166,9 +166,6 @@ def _view(camera: Camera, drawn: np.ndarray, label: int) -> View:
     return View.from_arrays(camera, np.where(drawn, np.int32(label), np.int32(UNKNOWN)))
 
 
-def _check_inside(camera: Camera, column: float, row: float) -> None:
-    if not (0 <= column < camera.width and 0 <= row < camera.height):
-        raise SettingsError(
-            f"correction: pixel is (column {column:g}, row {row:g}); expected one of the "
-            f"{camera.width} x {camera.height} of the picture"
-        )
+def _pixel(camera: Camera, column: float, row: float) -> tuple[int, int]:
+    """Row and column of the pixel that a place lies in; `SettingsError` where the picture has none there."""
+    return camera.checked_pixel(math.floor(row), math.floor(column))

@@ -148,7 +148,8 @@ def test_differences_are_red_and_only_they() -> None:
     images = ViewImages(SCENE)
     images.keep(view, np.full((48, 64, 3), 120, np.uint8))
     triple = draw_triple(compare_mask(view, predicted, 2), view, images, palette(2))
-    red = triple.difference[..., 0] > triple.difference[..., 1].astype(int) + 80
+    difference = triple[2]
+    red = difference[..., 0] > difference[..., 1].astype(int) + 80
     np.testing.assert_array_equal(red, (labels != predicted) & (labels != UNKNOWN))
     assert all(picture.shape == (48, 64, 3) and picture.dtype == np.uint8 for picture in triple)
 

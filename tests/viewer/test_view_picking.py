@@ -112,7 +112,7 @@ def test_what_was_drawn_is_labelled_and_all_else_is_unknown() -> None:
     assert np.array_equal(region(CAMERA, LABELS, column, row, 2).read_labels() == 2, LABELS == 1)
     alike = looks_alike(SCENE, CAMERA, column, row, 2).read_labels()
     assert set(np.unique(alike)) == {UNKNOWN, 2} and alike[row, column] == 2
-    with pytest.raises(SettingsError, match=r"pixel is \(column 64, row 3\); expected one of the 64 x 48"):
+    with pytest.raises(SettingsError, match=r"pixel is \(row 3, column 64\); expected a row from 0 to 47"):
         disc(CAMERA, 64, 3, 1, 1)
 
 
