@@ -7,7 +7,6 @@ of a block. A row of the table of projected Gaussians is what they read of it.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
 from typing import Any
 
 from llvmlite import ir
@@ -32,18 +31,6 @@ _COLUMNS_OF_BLOCKS = ir.Constant(
 )
 
 
-def _projected(build: Builder, position: int) -> Callable[[int], Any]:
-    """Columns of a row of the table: argument `position` is the table, the next one the row's number."""
-    number = build.arguments[position + 1]
-    first = build.llvm.mul(number, ir.Constant(number.type, 8))
-
-    def column(j: int) -> Any:
-        place = build.llvm.add(first, ir.Constant(number.type, j))
-        return build.llvm.load(build.element(position, place), align=4, typ=F32)
-
-    return column
-
-
 def _row_of_lines(build: Builder, pair: Any, i: int) -> Any:
     """Find the number of row i of a pair of lines among the rows of all pairs."""
     return build.llvm.add(build.llvm.mul(pair, ir.Constant(pair.type, 2)), ir.Constant(pair.type, i))
@@ -59,12 +46,41 @@ def _four_of(build: Builder, position: int, pair: Any, i: int, block: Any) -> An
     return build.llvm.shuffle_vector(four, ir.Constant(_FOUR, ir.Undefined), _EACH_FOUR_TIMES)
 
 
-def _power(build: Builder, first: int) -> Any:
+def _along_rows(build: Builder, position: int, rows: Any, left: Any, top: Any) -> tuple[Any, Any, Any]:
+    """Column of the largest alpha in sixteen rows of a tile, log2 of that alpha, and the WIDTH of the Gaussian.
+
+    Argument `position` is the table, the next one the row's number. The tile's first pixel has its centre at (left,
+    top).
+    """
+    llvm, number = build.llvm, build.arguments[position + 1]
+    first = llvm.mul(number, ir.Constant(number.type, 8))
+
+    def column(j: int) -> Any:
+        place = llvm.add(first, ir.Constant(number.type, j))
+        return llvm.load(build.element(position, place), align=4, typ=F32)
+
+    dy = llvm.fsub(rows, build.broadcast(llvm.fsub(column(V), top)))
+    x = build.fma(build.broadcast(column(SHEAR)), dy, build.broadcast(llvm.fsub(column(U), left)))
+    high = build.broadcast(llvm.fneg(column(HEIGHT)))
+    return x, build.fma(high, llvm.fmul(dy, dy), build.broadcast(column(LOG_OPACITY))), column(WIDTH)
+
+
+def _power(build: Builder, columns: Any, x: Any, peak: Any, wide: Any) -> Any:
+    """Log2 of alpha at some columns, before it is clipped, in rows where its largest is `peak`, at column x."""
+    offset = build.llvm.fsub(columns, x)
+    return build.fma(build.broadcast(build.llvm.fneg(wide)), build.llvm.fmul(offset, offset), peak)
+
+
+def _power_in_block(build: Builder, first: int) -> Any:
     """Log2 of alpha in a block, before it is clipped; arguments from `first` on: block, lines, pair and width."""
-    block, _, pair, width = build.arguments[first : first + 4]
-    offset = build.llvm.fsub(_pixel_columns(build, block), _four_of(build, first + 1, pair, 0, block))
-    peak, wide = _four_of(build, first + 1, pair, 1, block), build.broadcast(build.llvm.fneg(width))
-    return build.fma(wide, build.llvm.fmul(offset, offset), peak)
+    block, _, pair, wide = build.arguments[first : first + 4]
+    x, peak = (_four_of(build, first + 1, pair, i, block) for i in range(2))
+    return _power(build, _pixel_columns(build, block), x, peak, wide)
+
+
+def _counts(build: Builder, power: Any) -> Any:
+    """Whether alpha is large enough to count, by log2 of it."""
+    return build.llvm.fcmp_ordered(">=", power, constant(LOG_ALPHA_MIN))
 
 
 def _alpha(build: Builder, power: Any) -> Any:
@@ -90,11 +106,7 @@ def aim(build: Builder, table: Any, g: Any, left: Any, top: Any, lines: Any, pai
     there. A view of the pair would do, too, but kernels count who holds a view, and an atomic count takes as long as a
     block.
     """
-    llvm, column = build.llvm, _projected(build, 0)
-    dy = llvm.fsub(_ROWS, build.broadcast(llvm.fsub(column(V), top)))
-    x = build.fma(build.broadcast(column(SHEAR)), dy, build.broadcast(llvm.fsub(column(U), left)))
-    high, wide = build.broadcast(llvm.fneg(column(HEIGHT))), build.broadcast(llvm.fneg(column(WIDTH)))
-    peak = build.fma(high, llvm.fmul(dy, dy), build.broadcast(column(LOG_OPACITY)))
+    llvm, (x, peak, wide) = build.llvm, _along_rows(build, 0, _ROWS, left, top)
     build.store(x, build.address(4, _row_of_lines(build, pair, 0)))
     build.store(peak, build.address(4, _row_of_lines(build, pair, 1)))
     # In each row, no pixel of a block is nearer to the peak than this one, and its alpha is computed as `blend_block`
@@ -102,9 +114,7 @@ def aim(build: Builder, table: Any, g: Any, left: Any, top: Any, lines: Any, pai
     whole, bits = build.rint(x), ir.Constant(I64, 0)
     for i in range(SIDE):
         nearest = build.minimum(build.maximum(whole, constant(float(SIDE * i))), constant(SIDE * i + SIDE - 1.0))
-        offset = llvm.fsub(nearest, x)
-        power = build.fma(wide, llvm.fmul(offset, offset), peak)
-        found = build.bits(llvm.fcmp_ordered(">=", power, constant(LOG_ALPHA_MIN)))
+        found = build.bits(_counts(build, _power(build, nearest, x, peak, wide)))
         bits = llvm.or_(bits, llvm.shl(found, ir.Constant(I64, LANES * i)))
     # Bit 16 i + r of these is row r's, in the i-th column of blocks. Rows of four are put together, and columns of
     # blocks beside each other.
@@ -127,13 +137,13 @@ def blend_block(build: Builder, rays: Any, b: Any, lines: Any, pair: Any, wide: 
     of 1/255 alpha counts as 0. Returns its weights, and bits: the low sixteen say which rays are still open, the next
     ones which were hit.
     """
-    return _blended(build, lifts=False)
+    return _taken(build, _power_in_block(build, 1), lifts=False)
 
 
 @operation(_FOUND, None, types.int64, None, types.int64, types.float32)
 def lift_block(build: Builder, rays: Any, b: Any, lines: Any, pair: Any, wide: Any) -> Any:
     """Blend one Gaussian into block b of rays that lift a mask: as `blend_block`, but they end as `T_LIFTED` says."""
-    return _blended(build, lifts=True)
+    return _taken(build, _power_in_block(build, 1), lifts=True)
 
 
 @operation(_FOUND, None, None, None, None, types.intp, types.float32, types.float32)
@@ -143,15 +153,10 @@ def reach_pixels(build: Builder, rows: Any, columns: Any, b: Any, table: Any, g:
     Their rows and columns in the tile are in row b of the two arrays. What comes out is bit for bit what `aim` and
     `blend_block` find.
     """
-    llvm, column, number = build.llvm, _projected(build, 3), build.arguments[2]
-    dy = llvm.fsub(build.load(build.address(0, number)), build.broadcast(llvm.fsub(column(V), top)))
-    x = build.fma(build.broadcast(column(SHEAR)), dy, build.broadcast(llvm.fsub(column(U), left)))
-    high, wide = build.broadcast(llvm.fneg(column(HEIGHT))), build.broadcast(llvm.fneg(column(WIDTH)))
-    peak = build.fma(high, llvm.fmul(dy, dy), build.broadcast(column(LOG_OPACITY)))
-    offset = llvm.fsub(build.load(build.address(1, number)), x)
-    power = build.fma(wide, llvm.fmul(offset, offset), peak)
-    found = build.bits(llvm.fcmp_ordered(">=", power, constant(LOG_ALPHA_MIN)))
-    return build.context.make_tuple(llvm, build.signature.return_type, [power, found])
+    x, peak, wide = _along_rows(build, 3, build.load(build.address(0, b)), left, top)
+    power = _power(build, build.load(build.address(1, b)), x, peak, wide)
+    found = build.bits(_counts(build, power))
+    return build.context.make_tuple(build.llvm, build.signature.return_type, [power, found])
 
 
 @operation(_FOUND, None, None, row_type)
@@ -160,19 +165,12 @@ def blend_pixels(build: Builder, rays: Any, b: Any, power: Any) -> Any:
     return _taken(build, power, lifts=False)
 
 
-def _blended(build: Builder, lifts: bool) -> Any:
-    """Weights and bits of `blend_block`, or of `lift_block`; what is left of the rays is stored."""
-    return _taken(build, _power(build, 1), lifts)
-
-
 def _taken(build: Builder, power: Any, lifts: bool) -> Any:
-    """Take what one Gaussian takes of sixteen rays, by log2 of its alpha."""
+    """Take what one Gaussian takes of sixteen rays, by log2 of its alpha; what is left of them is stored."""
     llvm = build.llvm
     address = build.row(0)
     before = build.load(address)
-    hit = llvm.and_(
-        llvm.fcmp_ordered(">=", power, constant(LOG_ALPHA_MIN)), llvm.fcmp_ordered(">=", before, constant(T_MIN))
-    )
+    hit = llvm.and_(_counts(build, power), llvm.fcmp_ordered(">=", before, constant(T_MIN)))
     # The flag keeps those off it by which a caller would fuse product and difference: where weights are not asked for,
     # rays would end a bit apart.
     taken = llvm.fmul(_alpha(build, power), before, flags=("nsz",))
@@ -189,6 +187,5 @@ def _taken(build: Builder, power: Any, lifts: bool) -> Any:
 @operation(row_type, types.int64, None, types.int64, types.float32)
 def alpha_of(build: Builder, b: Any, lines: Any, pair: Any, wide: Any) -> Any:
     """Alpha of one Gaussian in block b, as `blend_block` has it, whatever lies in front."""
-    power = _power(build, 0)
-    found = build.llvm.fcmp_ordered(">=", power, constant(LOG_ALPHA_MIN))
-    return build.llvm.select(found, _alpha(build, power), constant(0.0))
+    power = _power_in_block(build, 0)
+    return build.llvm.select(_counts(build, power), _alpha(build, power), constant(0.0))
