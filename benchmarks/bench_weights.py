@@ -37,7 +37,7 @@ from gsseg_core.raster.cpu.tiling import TILE
 from gsseg_core.raster.observation import VoteShares
 from gsseg_core.raster.view_operator import ViewOperator
 from gsseg_core.scene.gaussian_scene import GaussianScene
-from gsseg_core.simd import FAST, LANES, add_scaled, add_scaled_where, first_bit, intrinsic, load_row, store_row
+from gsseg_core.simd import FAST, LANES, add_scaled, first_bit, intrinsic, load_row, store_row, where
 from gsseg_core.warm_up import warm_up
 
 STEPS = 65535.0
@@ -206,7 +206,8 @@ def share_stored(  # type: ignore[no-untyped-def]
                 else:
                     for span in range(spans[b], spans[b + 1]):
                         s = max(here[(e - start[tile]) * many + slots[span]], 0)
-                        total = add_scaled_where(total, weight, said[s] * np.float32(1 / STEPS), np.int64(lanes[span]))
+                        more = add_scaled(total, weight, said[s] * np.float32(1 / STEPS))
+                        total = where(np.int64(lanes[span]), more, total)
                 store_row(value, b, total)
         spare = left_over[label_start[tile] : label_start[tile + 1]]
         logs[tile] = label_pairs.invert(spans, mask, mask.weights[tile], rest[labels], final[tile], value, spare)

@@ -241,10 +241,16 @@ def at_most(build: Builder, a: Any, limit: Any) -> Any:
     return build.bits(build.llvm.fcmp_ordered("<=", a, build.broadcast(limit)))
 
 
-@operation(row_type, None, None, types.int64)
-def add_where(build: Builder, total: Any, a: Any, bits: Any) -> Any:
-    """Add two rows in the lanes of the bits that are set; elsewhere the first stays."""
-    return build.llvm.select(build.lanes(bits), build.llvm.fadd(total, a), total)
+@operation(row_type, types.int64, None, None)
+def where(build: Builder, bits: Any, a: Any, b: Any) -> Any:
+    """Take the one row in the lanes of the bits that are set, and the other one elsewhere."""
+    return build.llvm.select(build.lanes(bits), a, b)
+
+
+@operation(row_type, None, None)
+def add(build: Builder, total: Any, a: Any) -> Any:
+    """Add two rows."""
+    return build.llvm.fadd(total, a)
 
 
 @operation(row_type, None, None, None)
@@ -257,18 +263,6 @@ def add_product(build: Builder, total: Any, a: Any, b: Any) -> Any:
 def add_scaled(build: Builder, total: Any, a: Any, factor: Any) -> Any:
     """Add a multiple of a row."""
     return build.fma(build.broadcast(factor), a, total)
-
-
-@operation(row_type, None, None, None, types.int64)
-def add_product_where(build: Builder, total: Any, a: Any, b: Any, bits: Any) -> Any:
-    """Add a product of two rows in the lanes of the bits that are set."""
-    return build.llvm.select(build.lanes(bits), build.fma(a, b, total), total)
-
-
-@operation(row_type, None, None, types.float32, types.int64)
-def add_scaled_where(build: Builder, total: Any, a: Any, factor: Any, bits: Any) -> Any:
-    """Add a multiple of a row in the lanes of the bits that are set."""
-    return build.llvm.select(build.lanes(bits), build.fma(build.broadcast(factor), a, total), total)
 
 
 @operation(row_type, None, types.float32)

@@ -146,6 +146,14 @@ class ViewOperator(ViewRenderer):
             raise SceneValueError(f"hidden is {hidden.dtype} {hidden.shape}; expected bool ({self.num_gaussians},)")
         return self._without(hidden[self.ids])
 
+    def objects_alone(self, labels: np.ndarray) -> ObjectsAlone:
+        """Choose the Gaussians that belong to an object, those of labels (N,) int32 above 0, each object by itself.
+
+        Raises `SceneValueError` where the labels are of another number of Gaussians.
+        """
+        self._check_rows(len(labels), None, what="labels")
+        return self._objects_alone(labels)
+
     def visibility(self) -> np.ndarray:
         """Sum of each Gaussian's weights over the image: W^T 1, (N,) float32, in px."""
         return self.adjoint(np.ones((self.camera.height, self.camera.width, 1), np.float32))[:, 0]
@@ -185,14 +193,10 @@ class ViewOperator(ViewRenderer):
         """Make the view without some of `ids`, (M,) bool."""
 
     @abstractmethod
-    def _adjoint(self, residual: np.ndarray) -> np.ndarray: ...
+    def _objects_alone(self, labels: np.ndarray) -> ObjectsAlone: ...
 
     @abstractmethod
-    def objects_alone(self, labels: np.ndarray) -> ObjectsAlone:
-        """Choose the Gaussians that belong to an object, those of labels (N,) int32 above 0, each object by itself.
-
-        Raises `SceneValueError` where the labels are of another number of Gaussians.
-        """
+    def _adjoint(self, residual: np.ndarray) -> np.ndarray: ...
 
     @abstractmethod
     def _weights(self, pixel: tuple[int, int] | None) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

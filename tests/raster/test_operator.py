@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -14,7 +15,8 @@ from operator_cases import dense, make_camera, make_scene, one_gaussian, random_
 
 from gsseg_core.csr_rows import CSRRows
 from gsseg_core.errors import SceneValueError
-from gsseg_core.raster.cpu import blending as blend
+from gsseg_core.raster.cpu.blending import tile_of_turn
+from gsseg_core.raster.cpu.tiling import stride_of
 from gsseg_core.scene.camera import Camera
 
 SIZES = [(37, 21), (16, 16), (33, 50), (70, 5), (1, 1), (1, 40)]
@@ -349,14 +351,14 @@ def test_an_endless_needle_is_seen_in_the_rows_that_it_reaches(backend):
 
 @given(st.integers(1, 300), st.integers(1, 40))
 def test_every_tile_has_its_turn_once(rows, columns):
-    stride = blend.stride_of(rows)
-    turns = [blend.tile_of_turn.py_func(turn, columns, rows, stride) for turn in range(rows * columns)]
+    tiles = SimpleNamespace(columns=columns, rows=rows, stride=stride_of(rows))
+    turns = [tile_of_turn.py_func(tiles, turn) for turn in range(rows * columns)]
     assert sorted(turns) == list(range(rows * columns))
 
 
 @given(st.integers(1, 300), st.integers(2, 16))
 def test_every_thread_gets_rows_from_all_parts_of_the_image(rows, threads):
-    stride = blend.stride_of(rows)
+    stride = stride_of(rows)
     visited = np.array([turn * stride % rows for turn in range(rows)])
     for part in np.array_split(visited, threads):
         if len(part) >= 8:

@@ -46,23 +46,9 @@ def in_tile(b: int, lane: int) -> tuple[int, int]:
 
 
 @nb.njit(inline="always")
-def stride_of(rows: int) -> int:
-    """Rows of tiles from one turn to the next, so that as many turns visit each row once: about 0.618 of them all.
-
-    Every thread gets many turns in succession. Floors are full of Gaussians and ceilings empty, so no thread may get
-    the upper part of the image and another one the lower: multiples of the golden ratio are spread evenly, however many
-    there are.
-    """
-    stride = max(int(0.618 * rows), 1)
-    while np.gcd(stride, rows) != 1:
-        stride += 1
-    return stride
-
-
-@nb.njit(inline="always")
-def tile_of_turn(turn: int, columns: int, rows: int, stride: int) -> int:
+def tile_of_turn(tiles: Tiles, turn: int) -> int:
     """Which tile comes at a turn, of as many as there are tiles."""
-    return (turn // columns * stride % rows) * columns + turn % columns
+    return (turn // tiles.columns * tiles.stride % tiles.rows) * tiles.columns + turn % tiles.columns
 
 
 @nb.njit(inline="always")

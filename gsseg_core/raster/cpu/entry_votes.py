@@ -22,11 +22,7 @@ def pair_votes(ids: np.ndarray, tiles: Tiles, lifted: Lifted) -> PairVotes:  # (
     count = np.diff(labels.start)
     facts = np.stack([count, lifted.slot_start[:-1] - tiles.start[:-1] * count, labels.start[:-1]], axis=1)
     packed = _pack(tiles.start, facts, lifted.sums, labels.present)
-    # A chunk has at most one pair for each sum above zero: one for each of its entries, and `extra` more if all entries
-    # that have several are in this chunk; and it looks at the place after its last.
-    extra = lifted.counts[:, 3].sum() - lifted.counts[:, 0].sum() + 1
-    chunks = np.arange(CHUNKS + 1)
-    capacity = tiles.gaussian_start[chunks * len(ids) // CHUNKS] + extra * chunks
+    capacity = lifted.room_for_pairs(tiles)
     return _list_pairs(ids, tiles, facts, packed, lifted.sums, labels.present, len(lifted.classes), capacity)
 
 

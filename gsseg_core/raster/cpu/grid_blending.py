@@ -6,7 +6,7 @@ import numba as nb
 import numpy as np
 
 from gsseg_core.kernels.compiler import called_by_kernels, kernel
-from gsseg_core.raster.cpu.blending import corner_of, in_block, stride_of, tile_of_turn
+from gsseg_core.raster.cpu.blending import corner_of, in_block, tile_of_turn
 from gsseg_core.raster.cpu.splat import OPEN, blend_pixels, reach_pixels
 from gsseg_core.raster.cpu.tiling import TILE, Tiles
 from gsseg_core.simd import add_scaled, first_bit, load_row, prefetch, store_row
@@ -20,9 +20,8 @@ def render_grid(tiles: Tiles, codes: np.ndarray, first: int, step: int) -> tuple
     height, width = len(range(first, tiles.height, step)), len(range(first, tiles.width, step))
     channels = codes.shape[1]
     out, left_over = np.empty((height, width, channels), np.float32), np.empty((height, width), np.float32)
-    stride = stride_of(tiles.rows)
     for turn in nb.prange(tiles.rows * tiles.columns):
-        tile = tile_of_turn(turn, tiles.columns, tiles.rows, stride)
+        tile = tile_of_turn(tiles, turn)
         left, top = corner_of(tiles, tile)
         # Rows and columns of the grid that cross the tile, the last one excluded.
         low, high = _after(first, step, top, height), _after(first, step, top + TILE, height)

@@ -14,7 +14,7 @@ import numpy as np
 from gsseg_core import simd
 from gsseg_core.kernels.compiler import called_by_kernels, kernel
 from gsseg_core.raster.constants import CHUNKS, TINY
-from gsseg_core.raster.cpu.blending import open_rays, stride_of, tile_of_turn
+from gsseg_core.raster.cpu.blending import open_rays, tile_of_turn
 from gsseg_core.raster.cpu.lifting import Labels, weighted_blocks
 from gsseg_core.raster.cpu.splat import WIDTH, aim, lift_block
 from gsseg_core.raster.cpu.tiling import TILE, Tiles
@@ -136,9 +136,8 @@ def share(
     """
     logs, left_over = np.zeros(len(records)), np.zeros(len(labels.present))
     sums = np.empty(slot_start[-1], np.float32)
-    stride = stride_of(tiles.rows)
     for turn in nb.prange(tiles.rows * tiles.columns):
-        tile = tile_of_turn(turn, tiles.columns, tiles.rows, stride)
+        tile = tile_of_turn(tiles, turn)
         here = slice(labels.start[tile], labels.start[tile + 1])
         count = here.stop - here.start
         if count == 0:
@@ -188,7 +187,8 @@ def _blend_likelihood(
                 for span in range(spans[b], spans[b + 1]):
                     # Where there is no pair, the weights are zero.
                     s = max(pair[e * label_count + labels.slots[span]], 0)
-                    total = simd.add_scaled_where(total, weight, likelihood[s], np.int64(labels.lanes[span]))
+                    more = simd.add_scaled(total, weight, likelihood[s])
+                    total = simd.where(np.int64(labels.lanes[span]), more, total)
             simd.store_row(value, b, total)
 
 
@@ -249,8 +249,8 @@ def sum_shares(
                     if current >= 0:
                         sums[e * label_count + current] += simd.sum_row(lanewise)
                     current, lanewise = np.int64(labels.slots[span]), simd.zero_row()
-                here = np.int64(labels.lanes[span])
-                lanewise = simd.add_product_where(lanewise, weight, simd.load_row(inverse, b), here)
+                more = simd.add_product(lanewise, weight, simd.load_row(inverse, b))
+                lanewise = simd.where(np.int64(labels.lanes[span]), more, lanewise)
         if current >= 0:
             sums[e * label_count + current] += simd.sum_row(lanewise)
 

@@ -14,10 +14,11 @@ import numpy as np
 
 from gsseg_core.csr_rows import starts
 from gsseg_core.kernels.compiler import called_by_kernels, kernel
-from gsseg_core.raster.cpu.blending import aim_next, in_tile, open_rays, stride_of, tile_of_turn
+from gsseg_core.raster.constants import CHUNKS
+from gsseg_core.raster.cpu.blending import aim_next, in_tile, open_rays, tile_of_turn
 from gsseg_core.raster.cpu.splat import OPEN, SIDE, WIDTH, lift_block
 from gsseg_core.raster.cpu.tiling import TILE, Tiles
-from gsseg_core.simd import FAST, LANES, add_where, count_bits, first_bit, sum_row, zero_row
+from gsseg_core.simd import FAST, LANES, add, count_bits, first_bit, sum_row, where, zero_row
 
 
 class Labels(NamedTuple):
@@ -49,13 +50,21 @@ class Lifted(NamedTuple):
         blocks = np.ones((tiles.rows * SIDE, tiles.columns * SIDE), np.float32)
         if weights is not None:
             blocks[: weights.shape[0], : weights.shape[1]] = weights
-        cut, areas = _cut(mask, blocks, tiles.columns, tiles.rows, int(mask.max(initial=0)) + 1)
+        labels, areas = _cut(mask, blocks, tiles.columns, tiles.rows, int(mask.max(initial=0)) + 1)
         classes = np.flatnonzero(areas[0]).astype(np.int32)
         position = np.zeros(areas.shape[1], np.int32)
         position[classes] = np.arange(len(classes))
-        labels = Labels(*cut)._replace(present=position[cut[1]])
+        labels = labels._replace(present=position[labels.present])
         slot_start = starts(np.diff(tiles.start) * np.diff(labels.start))
         return cls(classes, areas[:, classes], labels, slot_start, *_lift(tiles, labels, slot_start))
+
+    def room_for_pairs(self, tiles: Tiles) -> np.ndarray:
+        """Where the (Gaussian, label) pairs of each chunk of Gaussians may begin, (CHUNKS + 1,): with room for all."""
+        # A chunk has at most one pair for each sum above zero: one for each of its entries, and `extra` more if all
+        # entries that have several are in this chunk; and kernels look at the place after its last.
+        extra = self.counts[:, 3].sum() - self.counts[:, 0].sum() + 1
+        chunks, count = np.arange(CHUNKS + 1), len(tiles.gaussian_start) - 1
+        return np.asarray(tiles.gaussian_start[chunks * count // CHUNKS] + extra * chunks)
 
     @property
     def sees(self) -> bool:
@@ -64,10 +73,8 @@ class Lifted(NamedTuple):
 
 
 @kernel
-def _cut(
-    mask: np.ndarray, blocks: np.ndarray, columns: int, rows: int, num_labels: int
-) -> tuple[tuple[np.ndarray, ...], np.ndarray]:
-    """Make what `Labels` holds of a mask (H, W) int32 with weights of `blocks`, (4 rows, 4 columns) float32.
+def _cut(mask: np.ndarray, blocks: np.ndarray, columns: int, rows: int, num_labels: int) -> tuple[Labels, np.ndarray]:
+    """Cut a mask (H, W) int32 into tiles, with weights of `blocks`, (4 rows, 4 columns) float32.
 
     Second come the pixels of each label, and the sum of their weights, (2, num_labels) float64.
     """
@@ -105,7 +112,8 @@ def _cut(
         for i in range(start[tile], n):
             slot_of[present[i]] = -1
         start[tile + 1] = n
-    return (start, present[:n].copy(), span_start, slots[:spans].copy(), lanes[:spans].copy(), weights), areas
+    labels = Labels(start, present[:n].copy(), span_start, slots[:spans].copy(), lanes[:spans].copy(), weights)
+    return labels, areas
 
 
 @called_by_kernels
@@ -125,9 +133,8 @@ def _lift(tiles: Tiles, labels: Labels, slot_start: np.ndarray) -> tuple[np.ndar
     """Blend the view, and sum weights by entry and label: the last three attributes of `Lifted`."""
     reached, sums = np.empty(len(tiles.entries), np.uint16), np.empty(slot_start[-1], np.float32)
     counts = np.empty((len(slot_start) - 1, 4), np.int64)
-    stride = stride_of(tiles.rows)
     for turn in nb.prange(tiles.rows * tiles.columns):
-        tile = tile_of_turn(turn, tiles.columns, tiles.rows, stride)
+        tile = tile_of_turn(tiles, turn)
         label_count = labels.start[tile + 1] - labels.start[tile]
         blocks = reached[tiles.start[tile] : tiles.start[tile + 1]]
         blocks[:] = 0
@@ -190,14 +197,14 @@ def _lift_tile(
                 live &= ~(1 << b)
             hit |= np.int64(bits >> LANES & labelled[b] > 0) << b
             if label_count == 1:
-                current, lanewise = np.int64(0), add_where(lanewise, weight, labelled[b])
+                current, lanewise = np.int64(0), where(labelled[b], add(lanewise, weight), lanewise)
                 continue
             for span in range(spans[b], spans[b + 1]):
                 if labels.slots[span] != current:
                     if current >= 0:
                         sums[(e - first) * label_count + current] += sum_row(lanewise)
                     current, lanewise = np.int64(labels.slots[span]), zero_row()
-                lanewise = add_where(lanewise, weight, np.int64(labels.lanes[span]))
+                lanewise = where(np.int64(labels.lanes[span]), add(lanewise, weight), lanewise)
         if current >= 0:
             sums[(e - first) * label_count + current] += sum_row(lanewise)
         reached[e - first] = hit

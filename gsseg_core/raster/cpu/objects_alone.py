@@ -23,26 +23,22 @@ class TileObjects(ObjectsAlone):
     @classmethod
     def of(cls, ids: np.ndarray, tiles: Tiles, labels: np.ndarray) -> TileObjects:
         """Choose them among the Gaussians of a view, `ids` (M',), by the labels (N,) int32 of the whole scene."""
-        labels, none = labels[ids], np.empty(0, np.int32)
+        labels = labels[ids]
         start, entries, rows = silhouette_kernels.choose(tiles.start, tiles.entries, labels)
-        return cls(ids[rows], labels[rows], tiles._replace(
-            table=take_rows(tiles.table, rows), start=start, entries=entries,
-            gaussian_start=none.astype(np.int64), gaussian_entries=none,
-        ))  # fmt: skip
+        return cls(ids[rows], labels[rows], Tiles(*tiles[:5], take_rows(tiles.table, rows), start, entries))
 
     @property
     def nbytes(self) -> int:
         """Bytes that they take."""
-        return sum(array.nbytes for array in (self.ids, self.labels, *self.tiles[4:]))
+        return sum(array.nbytes for array in (self.ids, self.labels, *self.tiles[5:]))
 
     def reasons_to_go(self, depths: np.ndarray, shown: np.ndarray, hidden_from: np.ndarray) -> np.ndarray:
         """Weigh what speaks against each Gaussian in its object."""
-        go = np.zeros(len(self.tiles.entries), np.float32)
-        silhouette_kernels.reasons_to_go(self.tiles, self.labels, depths, shown, hidden_from, go)
+        go = silhouette_kernels.reasons_to_go(self.tiles, self.labels, depths, shown, hidden_from)
         return silhouette_kernels.sums(self.tiles.entries, go, len(self.ids))
 
     def reasons_to_stay(self, kept: np.ndarray, asked: np.ndarray, shown: np.ndarray) -> np.ndarray:
         """Weigh what speaks for each Gaussian in its object."""
-        stay, count = np.zeros(len(self.tiles.entries), np.float32), int(self.labels.max(initial=0)) + 1
-        silhouette_kernels.reasons_to_stay(self.tiles, self.labels, count, kept, asked, shown, stay)
+        count = int(self.labels.max(initial=0)) + 1
+        stay = silhouette_kernels.reasons_to_stay(self.tiles, self.labels, count, kept, asked, shown)
         return silhouette_kernels.sums(self.tiles.entries, stay, len(self.ids))

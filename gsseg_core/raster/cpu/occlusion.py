@@ -6,7 +6,7 @@ import numba as nb
 import numpy as np
 
 from gsseg_core.kernels.compiler import kernel
-from gsseg_core.raster.cpu.blending import aim_next, blocks_with, corner_of, open_rays, stride_of, tile_of_turn
+from gsseg_core.raster.cpu.blending import aim_next, blocks_with, corner_of, open_rays, tile_of_turn
 from gsseg_core.raster.cpu.projection import project
 from gsseg_core.raster.cpu.splat import OPEN, WIDTH, lift_block
 from gsseg_core.raster.cpu.tiling import TILE, Tiles, assign
@@ -60,9 +60,8 @@ def _entry_depths(
 def _find_ends(tiles: Tiles, labelled: np.ndarray) -> np.ndarray:  # (H, W) bool
     """Find the entry of each tile at which its last labelled block ends, as `lifting` would, (T,) int64."""
     ends, table, entries = np.empty(tiles.rows * tiles.columns, np.int64), tiles.table, tiles.entries
-    stride = stride_of(tiles.rows)
     for turn in nb.prange(tiles.rows * tiles.columns):
-        tile = tile_of_turn(turn, tiles.columns, tiles.rows, stride)
+        tile = tile_of_turn(tiles, turn)
         rays, lines = np.empty((TILE, TILE), np.float32), np.empty((2, 2, TILE), np.float32)
         left, top, live = open_rays(tiles, tile, rays)
         live &= blocks_with(labelled, *corner_of(tiles, tile))

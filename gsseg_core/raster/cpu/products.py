@@ -18,7 +18,6 @@ from gsseg_core.raster.cpu.blending import (
     in_block,
     in_tile,
     open_rays,
-    stride_of,
     tile_of_turn,
 )
 from gsseg_core.raster.cpu.splat import OPEN, SIDE, WIDTH, blend_block
@@ -64,9 +63,8 @@ def render(tiles: Tiles, codes: CSRRows, rows: np.ndarray, channels: int) -> tup
     Row `rows[m]` of the codes, (M,) int32, is that of Gaussian m.
     """
     (out, left_over), nothing_else = _blank(tiles, channels), np.empty((len(rows), 0), np.float32)
-    stride = stride_of(tiles.rows)
     for turn in nb.prange(tiles.rows * tiles.columns):
-        tile = tile_of_turn(turn, tiles.columns, tiles.rows, stride)
+        tile = tile_of_turn(tiles, turn)
         values, slots, _, rays = _blend_codes(tiles, tile, codes, rows, channels, nothing_else, OPEN, 0)
         columns, (left, top) = np.flatnonzero(slots >= 0), corner_of(tiles, tile)
         for r in range(min(TILE, tiles.height - top)):
@@ -98,9 +96,8 @@ def strongest(
     out, half = np.zeros((tiles.height, tiles.width), np.int32), np.zeros((tiles.height, tiles.width), np.bool_)
     some = np.zeros((len(range(first, tiles.height, step)), len(range(first, tiles.width, step)), channels), np.float32)
     image, left_over = _blank(tiles, beside.shape[1])
-    stride = stride_of(tiles.rows)
     for turn in nb.prange(tiles.rows * tiles.columns):
-        tile = tile_of_turn(turn, tiles.columns, tiles.rows, stride)
+        tile = tile_of_turn(tiles, turn)
         left, top = corner_of(tiles, tile)
         looked_at = blocks_with(wanted, left, top) if wanted.size else OPEN
         if not looked_at:
@@ -249,9 +246,8 @@ def render_few(tiles: Tiles, codes: np.ndarray, wanted: np.ndarray) -> tuple[np.
     """
     channels, table, entries = codes.shape[1], tiles.table, tiles.entries
     out, left_over = _blank(tiles, channels)
-    stride = stride_of(tiles.rows)
     for turn in nb.prange(tiles.rows * tiles.columns):
-        tile = tile_of_turn(turn, tiles.columns, tiles.rows, stride)
+        tile = tile_of_turn(tiles, turn)
         last = tiles.start[tile + 1]
         rays, lines = np.empty((TILE, TILE), np.float32), np.empty((2, 2, TILE), np.float32)
         values, corner = np.zeros((TILE, channels, TILE), np.float32), corner_of(tiles, tile)
@@ -288,9 +284,8 @@ def adjoint(tiles: Tiles, residual: np.ndarray) -> np.ndarray:
     """Carry values of pixels, (H, W, C) float32 with C <= CHANNELS, back to the Gaussians: W^T r, (M, C) float32."""
     channels = residual.shape[2]
     sums, out = np.empty((len(tiles.entries), channels), np.float32), np.zeros((len(tiles.table), channels), np.float32)
-    stride = stride_of(tiles.rows)
     for turn in nb.prange(tiles.rows * tiles.columns):
-        tile = tile_of_turn(turn, tiles.columns, tiles.rows, stride)
+        tile = tile_of_turn(tiles, turn)
         first, records, (left, top) = tiles.start[tile], blend_tile(tiles, tile), corner_of(tiles, tile)
         values = np.zeros((TILE, channels, TILE), np.float32)
         for r in range(min(TILE, tiles.height - top)):
@@ -312,8 +307,25 @@ def adjoint(tiles: Tiles, residual: np.ndarray) -> np.ndarray:
     return out
 
 
+def list_weights(tiles: Tiles, pixel: tuple[int, int] | None) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """List W: pixels and rows of the table, (P,) int32, and weights, (P,) float32, nearest first in each pixel.
+
+    If only a `pixel` is wanted, those of its tile are listed.
+    """
+    wanted: np.ndarray = np.arange(tiles.columns * tiles.rows)
+    if pixel is not None:
+        wanted = wanted[[pixel[0] // TILE * tiles.columns + pixel[1] // TILE]]
+    counts, none = np.zeros(len(wanted) + 1, np.int64), np.empty(0, np.int32)
+    _list_weights(tiles, wanted, counts, none, none, np.empty(0, np.float32))
+    start = np.cumsum(counts)
+    pixels, rows = np.empty(start[-1], np.int32), np.empty(start[-1], np.int32)
+    weights = np.empty(start[-1], np.float32)
+    _list_weights(tiles, wanted, start, pixels, rows, weights)
+    return pixels, rows, weights
+
+
 @kernel(parallel=True)
-def list_weights(
+def _list_weights(
     tiles: Tiles, wanted: np.ndarray,  # (U,) tiles
     place: np.ndarray,  # (U + 1,) int64: where each tile's part begins; with empty lists, counts out (in place[1:])
     pixels: np.ndarray, rows: np.ndarray,  # (P,) int32 out: pixel; row of the table

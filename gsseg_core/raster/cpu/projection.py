@@ -58,8 +58,11 @@ class Pinhole(NamedTuple):
     """A camera as kernels take it."""
 
     viewmat: np.ndarray  # (4, 4) world to camera
-    K: np.ndarray  # (3, 3)
-    width: float  # px
+    fx: float  # px, as all that follow but the bounds
+    fy: float
+    cx: float
+    cy: float
+    width: float
     height: float
     x_low: float  # between these x / z and these y / z the camera is linearised
     x_high: float
@@ -68,12 +71,12 @@ class Pinhole(NamedTuple):
 
     @classmethod
     def of(cls, camera: Camera) -> Pinhole:
-        """Take what is needed of a camera; matrices that lie by columns would have every kernel compiled for them."""
+        """Take what is needed of a camera; a matrix that lies by columns would have every kernel compiled for it."""
         width, height = float(camera.width), float(camera.height)
         fx, fy, cx, cy = camera.K[[0, 1, 0, 1], [0, 1, 2, 2]].tolist()
         across, down = FRUSTUM_MARGIN * 0.5 * width / fx, FRUSTUM_MARGIN * 0.5 * height / fy
         return cls(
-            np.ascontiguousarray(camera.world_to_camera), np.ascontiguousarray(camera.K), width, height,
+            np.ascontiguousarray(camera.world_to_camera), fx, fy, cx, cy, width, height,
             -cx / fx - across, (width - cx) / fx + across, -cy / fy - down, (height - cy) / fy + down,
         )  # fmt: skip
 
@@ -213,7 +216,7 @@ def _sides(lens: Pinhole) -> tuple[Side, Side, Side, Side, Side]:
     The reach is bounded by the longest axis and opacity 1, with sqrt(a^2 + b^2) <= |a| + |b|, twice, and with the
     outermost ray at which the camera is linearised. All is multiplied by depth, so nothing is divided.
     """
-    fx, fy, cx, cy = lens.K[0, 0], lens.K[1, 1], lens.K[0, 2], lens.K[1, 2]
+    fx, fy, cx, cy = lens.fx, lens.fy, lens.cx, lens.cy
     across = LARGEST_REACH * fx * (1.0 + max(abs(lens.x_low), abs(lens.x_high)))
     down = LARGEST_REACH * fy * (1.0 + max(abs(lens.y_low), abs(lens.y_high)))
     margin = LARGEST_REACH * ROOT
@@ -303,7 +306,7 @@ def _project_near(
     Divisions and roots cost more than all else here, so each is done once. Nothing may be contracted: the last of a
     batch are projected one by one, and must come out as the others do.
     """
-    pose, fx, fy, cx, cy = lens.viewmat, lens.K[0, 0], lens.K[1, 1], lens.K[0, 2], lens.K[1, 2]
+    pose, fx, fy, cx, cy = lens.viewmat, lens.fx, lens.fy, lens.cx, lens.cy
     v00, v01, v02, tx = pose[0, 0], pose[0, 1], pose[0, 2], pose[0, 3]
     v10, v11, v12, ty = pose[1, 0], pose[1, 1], pose[1, 2], pose[1, 3]
     v20, v21, v22, tz = pose[2, 0], pose[2, 1], pose[2, 2], pose[2, 3]

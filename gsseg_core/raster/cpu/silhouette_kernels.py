@@ -7,7 +7,7 @@ import numpy as np
 
 from gsseg_core.kernels.compiler import called_by_kernels, kernel
 from gsseg_core.raster.constants import T_MIN
-from gsseg_core.raster.cpu.blending import corner_of, in_block, open_rays, stride_of, tile_of_turn
+from gsseg_core.raster.cpu.blending import corner_of, in_block, open_rays, tile_of_turn
 from gsseg_core.raster.cpu.splat import WIDTH, aim, alpha_of
 from gsseg_core.raster.cpu.tiling import TILE, Tiles
 from gsseg_core.simd import (
@@ -60,13 +60,12 @@ def choose(start: np.ndarray, entries: np.ndarray, labels: np.ndarray) -> tuple[
 def reasons_to_go(
     tiles: Tiles, labels: np.ndarray, depths: np.ndarray,  # (M,) int32 above 0, (M,)
     shown: np.ndarray, hidden_from: np.ndarray,  # (H, W), (H, W)
-    go: np.ndarray,  # (E,) out, zeros
-) -> None:  # fmt: skip
-    """Sum by entry its Gaussian's alphas over the pixels that show another label, where they do not hide it."""
+) -> np.ndarray:  # fmt: skip
+    """Sum by entry its Gaussian's alphas over the pixels that show another label, where they do not hide it: (E,)."""
     table, start, entries = tiles.table, tiles.start, tiles.entries
-    stride = stride_of(tiles.rows)
+    go = np.zeros(len(entries), np.float32)
     for turn in nb.prange(tiles.rows * tiles.columns):
-        tile = tile_of_turn(turn, tiles.columns, tiles.rows, stride)
+        tile = tile_of_turn(tiles, turn)
         fresh, lines = np.empty((TILE, TILE), np.float32), np.empty((2, TILE), np.float32)
         left, top, inside = open_rays(tiles, tile, fresh)
         seen, limit = np.full((TILE, TILE), _UNKNOWN, np.int32), np.zeros((TILE, TILE), np.float32)
@@ -93,19 +92,22 @@ def reasons_to_go(
                     outside = seen[b, i] != label and seen[b, i] >= 0 and z <= limit[b, i]
                     total += alpha[0, i] if outside else np.float32(0)
             go[e] = total
+    return go
 
 
 @kernel(parallel=True, error_model="numpy", fastmath=FAST)
 def reasons_to_stay(
     tiles: Tiles, labels: np.ndarray, num_labels: int,  # (M,) int32 above 0
     kept: np.ndarray, asked: np.ndarray, shown: np.ndarray,  # (M,) float32, (M,) bool, (H, W)
-    stay: np.ndarray,  # (E,) out, zeros
-) -> None:  # fmt: skip
-    """Sum by entry its Gaussian's alpha T_k / (1 - T_k) over the pixels that show its object k, for those asked for."""
+) -> np.ndarray:  # fmt: skip
+    """Sum by entry its Gaussian's alpha T_k / (1 - T_k) over the pixels that show its object k, for those asked for.
+
+    Returns (E,) float32.
+    """
     table, start, entries = tiles.table, tiles.start, tiles.entries
-    stride = stride_of(tiles.rows)
+    stay = np.zeros(len(entries), np.float32)
     for turn in nb.prange(tiles.rows * tiles.columns):
-        tile = tile_of_turn(turn, tiles.columns, tiles.rows, stride)
+        tile = tile_of_turn(tiles, turn)
         seen = np.full((TILE, TILE), _UNKNOWN, np.int32)
         corner = corner_of(tiles, tile)
         _cut(shown, *corner, seen)
@@ -146,7 +148,7 @@ def reasons_to_stay(
                 if sum_row(after) < T_MIN:
                     live[slot] &= ~(1 << b)
         need = np.zeros_like(through)
-        _weigh(seen, slots, through, need)
+        _weigh(seen, through, need)
         for e in range(start[tile], start[tile + 1]):
             g = entries[e]
             slot, total = slots[labels[g]], zero_row()
@@ -158,6 +160,7 @@ def reasons_to_stay(
                     alpha = alpha_of(b, lines, 0, table[g, WIDTH])
                     total = add_product(total, alpha, load_row(need, slot * TILE + b))
                 stay[e] = sum_row(total)
+    return stay
 
 
 @kernel
@@ -205,34 +208,33 @@ def _joined(known: np.int32, label: np.int32) -> np.int32:
 
 
 @called_by_kernels
-def _slot_of(label: int, slots: np.ndarray) -> int:
-    return slots[label] if 0 < label < len(slots) else _NOT_SHOWN
+def _blocks_by_slot(seen: np.ndarray, slots: np.ndarray) -> tuple[np.ndarray, int]:  # (16, 16), by label; changed
+    """Give each label that a tile shows a slot, and put that in its place.
 
-
-@called_by_kernels
-def _blocks_by_slot(seen: np.ndarray, slots: np.ndarray) -> tuple[np.ndarray, int]:  # (16, 16); by label, changed
-    """Give each label that a tile shows a slot; returns in which blocks it is, as bits by slot, and how many slots."""
+    Returns in which blocks it is, as bits by slot, and how many slots there are.
+    """
     blocks, count = np.zeros(_NOT_SHOWN + 1, np.int64), 0
     for b in range(TILE):
         for i in range(TILE):
             label = seen[b, i]
             if not 0 < label < len(slots):
+                seen[b, i] = _NOT_SHOWN
                 continue
             if slots[label] == _NOT_SHOWN:
                 slots[label] = count
                 count += 1
+            seen[b, i] = slots[label]
             blocks[slots[label]] |= 1 << b
     return blocks, count
 
 
 @called_by_kernels(fastmath={"contract", "nnan", "nsz"}, error_model="numpy")
 def _weigh(
-    seen: np.ndarray, slots: np.ndarray,  # (16, 16)
+    seen: np.ndarray,  # (16, 16): slots
     through: np.ndarray, need: np.ndarray,  # (16 S, 16) T_k; out, T_k / (1 - T_k) where label k is shown
 ) -> None:  # fmt: skip
     for b in range(TILE):
         for i in range(TILE):
-            slot = _slot_of(seen[b, i], slots)
-            if slot != _NOT_SHOWN:
-                n = slot * TILE + b
+            if seen[b, i] != _NOT_SHOWN:
+                n = seen[b, i] * TILE + b
                 need[n, i] = through[n, i] / (np.float32(1) - through[n, i] + ROUNDING)

@@ -18,7 +18,7 @@ from gsseg_core.raster.cpu.lifting import Lifted
 from gsseg_core.raster.cpu.objects_alone import TileObjects
 from gsseg_core.raster.cpu.projection import joined, project
 from gsseg_core.raster.cpu.splat import HEIGHT, LOG_OPACITY, WIDTH
-from gsseg_core.raster.cpu.tiling import TILE, Tiles, assign
+from gsseg_core.raster.cpu.tiling import Tiles, assign
 from gsseg_core.raster.objects_alone import ObjectsAlone
 from gsseg_core.raster.observation import LabelWeights, Observation, VoteShares
 from gsseg_core.raster.view_operator import ViewOperator
@@ -49,9 +49,7 @@ class TileOperator(ViewOperator):
         area = np.pi / np.log(2.0) / np.sqrt(table[:, WIDTH] * table[:, HEIGHT])
         return np.exp2(table[:, LOG_OPACITY]) * area
 
-    def objects_alone(self, labels: np.ndarray) -> ObjectsAlone:
-        """Choose the Gaussians that belong to an object."""
-        self._check_rows(len(labels), None, what="labels")
+    def _objects_alone(self, labels: np.ndarray) -> ObjectsAlone:
         return TileObjects.of(self.ids, self._tiles, labels)
 
     def _without(self, hidden: np.ndarray) -> TileOperator:
@@ -102,17 +100,7 @@ class TileOperator(ViewOperator):
         return out
 
     def _weights(self, pixel: tuple[int, int] | None) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        tiles = self._tiles
-        wanted: np.ndarray = np.arange(tiles.columns * tiles.rows)
-        if pixel is not None:
-            wanted = np.array([pixel[0] // TILE * tiles.columns + pixel[1] // TILE])
-        counts, none = np.zeros(len(wanted) + 1, np.int64), np.empty(0, np.int32)
-        products.list_weights(tiles, wanted, counts, none, none, np.empty(0, np.float32))
-        start = np.cumsum(counts)
-        pixels, rows = np.empty(start[-1], np.int32), np.empty(start[-1], np.int32)
-        weights = np.empty(start[-1], np.float32)
-        products.list_weights(tiles, wanted, start, pixels, rows, weights)
-        return pixels, rows, weights
+        return products.list_weights(self._tiles, pixel)
 
     def _observe(self, labels: np.ndarray, weights: np.ndarray | None) -> Observation:
         return TileObservation(self.camera.name, self.ids, self._tiles, Lifted.of(self._tiles, labels, weights))
@@ -159,11 +147,7 @@ class TileObservation(Observation):
         kept, shared, self._blocks = label_pairs.keep_entries(
             tiles.start, lifted.reached, start, shared_start, self._mask.weights
         )
-        # A chunk has at most one pair for each sum above zero: one for each of its entries, and `extra` more if all
-        # entries that have several are in this chunk.
-        extra = counts[:, 3].sum() - counts[:, 0].sum()
-        chunks = np.arange(CHUNKS + 1) * len(ids) // CHUNKS
-        capacity = tiles.gaussian_start[chunks] + extra * np.arange(len(chunks))
+        capacity = lifted.room_for_pairs(tiles)
         begins = (tiles.start, lifted.slot_start, shared_start, self._slot_start, self._mask.start)
         facts = np.stack([*(begin[:-1] for begin in begins), label_count], axis=1)
         entries, self._pair = np.empty(start[-1], np.int32), np.empty(self._slot_start[-1], np.int32)
@@ -171,15 +155,13 @@ class TileObservation(Observation):
             tiles, kept, facts, lifted.sums, self._mask.present, len(self.classes), capacity, entries, self._pair
         )
         before = np.cumsum(found, axis=0) - found
-        seen, counts = (joined(part, chunks[:-1], found[:, 0]) for part in (gaussians, label_counts))
+        chunks = np.arange(CHUNKS) * len(ids) // CHUNKS
+        seen, counts = (joined(part, chunks, found[:, 0]) for part in (gaussians, label_counts))
         labels, votes = (joined(part, capacity[:-1], found[:, 1]) for part in (labels, votes))
         label_pairs.number_on(entries, before[:, 0])
         label_pairs.number_on(self._pair, before[:, 1])
         self.ids, self.start, self.labels, self._votes = ids[seen], starts(counts), labels, votes
-        table, none = take_rows(tiles.table, seen), np.empty(0, np.int64)
-        self._tiles = tiles._replace(
-            table=table, start=start, entries=entries, gaussian_start=none, gaussian_entries=none.astype(np.int32)
-        )
+        self._tiles = Tiles(*tiles[:5], take_rows(tiles.table, seen), start, entries)
         self._shared = self._tiles._replace(start=shared_start, entries=entries[shared])
 
     def __getstate__(self) -> dict[str, Any]:
@@ -189,7 +171,7 @@ class TileObservation(Observation):
     @property
     def nbytes(self) -> int:
         """Memory that it holds, in bytes."""
-        held = (self.ids, self.start, self.labels, self._votes, *self._tiles[4:],
+        held = (self.ids, self.start, self.labels, self._votes, *self._tiles[5:],
                 self._shared.start, self._shared.entries, self._blocks, self._records, self._slot_start, self._pair,
                 *self._mask)  # fmt: skip
         # And what `shares` was called with last, and returned.

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from typing import NamedTuple
 
 import numba as nb
@@ -33,11 +34,13 @@ class Tiles(NamedTuple):
     height: int
     columns: int  # of tiles
     rows: int
+    stride: int  # rows of tiles from one turn of a thread to the next
     table: np.ndarray  # (M, 8) float32: projected Gaussians, as `Projected` has them
     start: np.ndarray  # (columns * rows + 1,) int64: entries of tile t are start[t] to start[t + 1]
     entries: np.ndarray  # (E,) int32: row of each entry's Gaussian in the table
-    gaussian_start: np.ndarray  # (M + 1,) int64: the same relation by Gaussian
-    gaussian_entries: np.ndarray  # (E,) int32: its entries, in tile order
+    # The same relation by Gaussian, where that is kept:
+    gaussian_start: np.ndarray = np.empty(0, np.int64)  # (M + 1,) int64
+    gaussian_entries: np.ndarray = np.empty(0, np.int32)  # (E,) int32: the entries of each, in tile order
 
 
 def assign(projected: Projected, width: int, height: int) -> Tiles:
@@ -61,7 +64,21 @@ def assign(projected: Projected, width: int, height: int) -> Tiles:
     place = np.cumsum(counts, axis=0) - counts + start[:-1]
     entries = np.empty(start[-1], np.int32)
     _fill(touched, gaussian_start, projected.order, place, entries)
-    return Tiles(width, height, columns, rows, projected.table, start, entries, gaussian_start, touched)
+    size = width, height, columns, rows, stride_of(rows)
+    return Tiles(*size, projected.table, start, entries, gaussian_start, touched)
+
+
+def stride_of(rows: int) -> int:
+    """Rows of tiles from one turn to the next, so that as many turns visit each row once: about 0.618 of them all.
+
+    Every thread gets many turns in succession. Floors are full of Gaussians and ceilings empty, so no thread may get
+    the upper part of the image and another one the lower: multiples of the golden ratio are spread evenly, however many
+    there are.
+    """
+    stride = max(int(0.618 * rows), 1)
+    while math.gcd(stride, rows) != 1:
+        stride += 1
+    return stride
 
 
 def check_entries(total: int, width: int, height: int) -> None:

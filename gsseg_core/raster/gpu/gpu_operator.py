@@ -12,9 +12,9 @@ import numpy as np
 import torch
 
 from gsseg_core.csr_rows import CSRRows
-from gsseg_core.raster.constants import ALPHA_MAX, T_MIN
-from gsseg_core.raster.cpu.splat import HEIGHT, LOG_ALPHA_MIN, LOG_OPACITY, SHEAR, WIDTH, U, V
-from gsseg_core.raster.cpu.tiling import TILE
+from gsseg_core.raster.cpu.products import list_weights
+from gsseg_core.raster.cpu.splat import HEIGHT, LOG_OPACITY, WIDTH
+from gsseg_core.raster.cpu.tiling import Tiles, stride_of
 from gsseg_core.raster.gpu import blending
 from gsseg_core.raster.gpu.device import find_gpu, launch, on_device, to_cpu
 from gsseg_core.raster.gpu.gpu_observation import GPUObservation
@@ -144,36 +144,12 @@ class GPUOperator(ViewOperator):
         return out
 
     def _weights(self, pixel: tuple[int, int] | None) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Written in PyTorch: whoever lists weights is in no hurry."""
+        """On the CPU, to which the tiles are copied: whoever lists weights is in no hurry."""
         tiles = self.tiles
-        begins = tiles.start.tolist()
-        wanted = range(len(begins) - 1) if pixel is None else [pixel[0] // TILE * tiles.columns + pixel[1] // TILE]
-        parts = [(np.empty(0, np.int32), np.empty(0, np.int32), np.empty(0, np.float32))]
-        for tile in wanted:
-            top, left = tile // tiles.columns * TILE, tile % tiles.columns * TILE
-            bottom, right = min(top + TILE, tiles.height), min(left + TILE, tiles.width)
-            r, c = (place.ravel() for place in np.mgrid[top:bottom, left:right])
-            entries = tiles.entries[begins[tile] : begins[tile + 1]].long()
-            here = self._weights_of(entries, on_device(np.stack([c, r], axis=1) + np.float32(0.5), self._device))
-            p, e = here.nonzero(as_tuple=True)
-            listed = (r * tiles.width + c)[to_cpu(p)].astype(np.int32)
-            parts.append((listed, to_cpu(entries[e].int()), to_cpu(here[p, e])))
-        pixels, rows, weights = (np.concatenate(part) for part in zip(*parts, strict=True))
-        return pixels, rows, weights
+        arrays = map(to_cpu, (tiles.table, tiles.start, tiles.entries))
+        return list_weights(Tiles(*tiles[:4], stride_of(tiles.rows), *arrays), pixel)
 
-    def _weights_of(self, entries: torch.Tensor, pixels: torch.Tensor) -> torch.Tensor:
-        """Weights (P, E) of a tile's entries (E,), nearest first, in pixels with these centres, (P, 2) as x and y."""
-        u, v, shear, wide, high, log_opacity = self.tiles.table[entries].T[[U, V, SHEAR, WIDTH, HEIGHT, LOG_OPACITY]]
-        dx, dy = pixels[:, :1].float() - u, pixels[:, 1:].float() - v
-        power = log_opacity - wide * (dx - shear * dy) ** 2 - high * dy * dy
-        alpha = torch.where(power >= LOG_ALPHA_MIN, torch.exp2(power).clamp_max(ALPHA_MAX), 0)
-        behind = torch.cumprod(1 - alpha, dim=1)
-        before = torch.cat([torch.ones_like(behind[:, :1]), behind], dim=1)[:, :-1]
-        return alpha * before * (before >= T_MIN)
-
-    def objects_alone(self, labels: np.ndarray) -> ObjectsAlone:
-        """Choose the Gaussians that belong to an object."""
-        self._check_rows(len(labels), None, what="labels")
+    def _objects_alone(self, labels: np.ndarray) -> ObjectsAlone:
         return GPUObjects.of(self.tiles, labels)
 
     def _observe(self, labels: np.ndarray, weights: np.ndarray | None) -> Observation:

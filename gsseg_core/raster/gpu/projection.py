@@ -115,8 +115,8 @@ def _nearest_first(
 
 def _lens_of(camera: Camera) -> np.ndarray:
     """Write a camera as the kernel takes it: viewmat, fx, fy, cx, cy, size, and where it is linearised, (22,)."""
-    pose, K, *size_and_bounds = Pinhole.of(camera)
-    return np.array([*pose[:3].ravel(), *K[[0, 1, 0, 1], [0, 1, 2, 2]], *size_and_bounds], np.float64)
+    pose, *numbers = Pinhole.of(camera)
+    return np.array([*pose[:3].ravel(), *numbers], np.float64)
 
 
 @gpu_kernel
