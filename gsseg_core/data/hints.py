@@ -76,12 +76,34 @@ def camera_hint(folder: Path) -> str:
 
 def mask_hint(root: Path, labels: str, stems: Collection[str]) -> str:
     """Hint at masks of the cameras' names `stems`, if a dataset has none in its sub-folder `labels`."""
-    stem = next(iter(stems), "<stem>")
-    looked = f"; looked for {root / labels}/{stem}.png ({stem}.npz, or a folder {stem}/) and so on"
-    classes = _folders_by_class(root / labels, stems)
-    if classes:
+    stem, folder = next(iter(stems), "<stem>"), root / labels
+    looked = f"; looked for {folder}/{stem}.png ({stem}.npz, or a folder {stem}/) and so on"
+    for_each = f"for each view, {labels}/{stem}/<class id>.png ({_MORE})"
+    expected = f"label images as PNG, and probabilities as {stem}.npz or {stem}/<class id>.tif ({_MORE})"
+    if classes := _folders_by_class(folder, stems):
         wrong = f"{labels}/ has a folder for each class, such as {classes[0].name}/"
-        return f"{looked}, but {wrong}: make one for each view, {labels}/{stem}/<class id>.png ({_MORE})"
+        return f"{looked}, but {wrong}: make one {for_each}"
+    if found := _masks_elsewhere(root, labels, stems):
+        count, name = found
+        where = name + "/" * (root / name).is_dir()
+        return f"{looked}, found {count} masks of these names in {where}: type --labels {shlex.quote(name)}"
+    if folder.is_symlink() and not folder.exists():
+        return f"{looked}, but {labels} is a link to {os.readlink(folder)}, which does not exist"
+    if not folder.is_dir():
+        return f"{looked}, but {_seen_instead(root, labels, stems, expected)}"
+    there = sorted(path for path in folder.iterdir() if path.name != SUPERVISES)
+    there = [path for path in there if path.suffix.lower() in _MASKS or _has_detections(path)]
+    if not there:
+        return f"{looked}, but {labels}/ holds no mask"
+    if there[0].is_file() and there[0].suffix.lower() not in (".png", ".npz"):
+        return f"{looked}, but {labels}/ holds files such as {there[0].name}; expected {expected}"
+    several = sum(path.stem.startswith((f"{stem}_", f"{stem}-")) for path in there) > 1
+    fix = f", several of a view: make a folder {for_each}" if several else ": rename them to the names of the images"
+    return f"{looked}, but {labels}/ holds names such as {there[0].name}{fix}"
+
+
+def _masks_elsewhere(root: Path, labels: str, stems: Collection[str]) -> tuple[int, str] | None:
+    """Count masks of the cameras' names in the place that has most of them; with its name, as `--labels` takes it."""
     below = (root / labels).resolve()
     outside = not below.is_relative_to(root.resolve())
     counts = [
@@ -92,33 +114,21 @@ def mask_hint(root: Path, labels: str, stems: Collection[str]) -> str:
     count, place = max(
         counts, key=lambda found: (found[0] > 0 and below in found[1].resolve().parents, found[0]), default=(0, root)
     )
-    if count:
-        if (more := len(_masks(masks_below, place.parent, stems))) > count and place.parent != root:
-            count, place = more, place.parent
-        name = str(place) if outside and place.is_relative_to(root / labels) else os.path.relpath(place, root)
-        where = name + "/" * place.is_dir()
-        return f"{looked}, found {count} masks of these names in {where}: type --labels {shlex.quote(name)}"
-    if (root / labels).is_symlink() and not (root / labels).exists():
-        return f"{looked}, but {labels} is a link to {os.readlink(root / labels)}, which does not exist"
-    expected = f"label images as PNG, and probabilities as {stem}.npz or {stem}/<class id>.tif ({_MORE})"
-    if not (root / labels).is_dir():
-        folders = [path for path in _folders(root) if _stems(path) & set(stems)]
-        if folder := next((path for path in folders if _OF_MASKS.search(path.name)), None):
-            name = min(path.name for path in folder.iterdir() if path.stem in stems)
-            return f"{looked}, but {folder.relative_to(root)}/ holds files such as {name}; expected {expected}"
-        photos = [path.name for path in folders]
-        hint = f" ({photos[0]}/ holds photos; a 2D segmenter makes masks of them)" if photos else ""
-        return f"{looked}, but there is no folder {labels}/{hint}"
-    there = sorted(path for path in (root / labels).iterdir() if path.name != SUPERVISES)
-    found = [path for path in there if path.suffix.lower() in _MASKS or _has_detections(path)]
-    if not found:
-        return f"{looked}, but {labels}/ holds no mask"
-    if found[0].is_file() and found[0].suffix.lower() not in (".png", ".npz"):
-        return f"{looked}, but {labels}/ holds files such as {found[0].name}; expected {expected}"
-    wrong = f"{looked}, but {labels}/ holds names such as {found[0].name}"
-    if sum(path.stem.startswith((f"{stem}_", f"{stem}-")) for path in found) > 1:
-        return f"{wrong}, several of a view: make a folder for each view, {labels}/{stem}/<class id>.png ({_MORE})"
-    return f"{wrong}: rename them to the names of the images"
+    if not count:
+        return None
+    if (more := len(_masks(masks_below, place.parent, stems))) > count and place.parent != root:
+        count, place = more, place.parent
+    return count, str(place) if outside and place.is_relative_to(root / labels) else os.path.relpath(place, root)
+
+
+def _seen_instead(root: Path, labels: str, stems: Collection[str], expected: str) -> str:
+    """Say that there is no folder of masks, and what the folders are whose files have the cameras' names."""
+    folders = [path for path in _folders(root) if _stems(path) & set(stems)]
+    if folder := next((path for path in folders if _OF_MASKS.search(path.name)), None):
+        name = min(path.name for path in folder.iterdir() if path.stem in stems)
+        return f"{folder.relative_to(root)}/ holds files such as {name}; expected {expected}"
+    hint = f" ({folders[0].name}/ holds photos; a 2D segmenter makes masks of them)" if folders else ""
+    return f"there is no folder {labels}/{hint}"
 
 
 def _places_of_masks(root: Path, labels: str, *, outside: bool) -> dict[Path, int]:
