@@ -97,7 +97,7 @@ class StagedRun:
 
     def begin(self) -> None:
         """Make the folder, finish or remove what dead runs left in it, and see that something can be written there."""
-        try:
+        with _writing(self.out):
             if os.path.lexists(self.out) and not self.out.is_dir():
                 raise PathTakenError(f"{self.out}: is not a folder; expected one, or nothing")
             self._made = [path for path in (self.out, *self.out.parents) if not path.exists()]
@@ -114,8 +114,6 @@ class StagedRun:
                 probe.flush()
                 os.fsync(probe.fileno())  # Some disks say only now that they are full.
             os.unlink(self._staging / "probe")
-        except (OSError, ValueError) as error:  # ValueError: a NUL in the path
-            raise _unwritable(self.out, error) from error
 
     def claim(self, places: Iterable[str]) -> None:
         """Raise `PathTakenError` if a place that the run will write is taken by what no run of its kind wrote.
@@ -131,11 +129,9 @@ class StagedRun:
         gone = [place for place in manifest.files(self._kind) if _lies_in(self.out, place)]
         for folder in sorted({folder for place in (*places, *gone) for folder in Path(place).parents[:-1]}):
             _check_same_disk(self._staging, self.out / folder)
-        try:
+        with _writing(self.out):
             for place in sorted({RUN_FILE, *places, *gone}):
                 check_changeable(self.out / place, self.out / place)
-        except OSError as error:
-            raise _unwritable(self.out, error) from error
 
     def keep_apart(self, inputs: Iterable[str | os.PathLike[str]]) -> None:
         """Raise `PathTakenError` if what the run reads is the folder that it writes to, or goes with its last run."""
@@ -152,15 +148,13 @@ class StagedRun:
                 )
 
     def _before(self) -> Manifest:
-        try:
+        with _writing(self.out):
             return Manifest.read(self.out / RUN_FILE)
-        except OSError as error:
-            raise _unwritable(self.out, error) from error
 
     def commit(self) -> None:
         """Make what was written the result."""
         files = [path for path in self.folder.rglob("*") if not path.is_dir()]
-        try:
+        with _writing(self.out, "what was there before is unchanged"):
             with ThreadPoolExecutor() as threads:  # A digest leaves the other cores to others.
                 places = [path.relative_to(self.folder).as_posix() for path in files]
                 records = dict(zip(places, threads.map(FileRecord.of, files), strict=True))
@@ -179,10 +173,6 @@ class StagedRun:
                 os.rename(self._staging / COMMIT_FILE, self.out / COMMIT_FILE)  # Now it is the result.
                 sync_folder(self.out)
                 _finish(self.out)
-        except OSError as error:
-            raise WriteError(
-                f"{self.out}: cannot be written ({reason(error)}); what was there before is unchanged"
-            ) from error
 
     def close(self) -> None:
         """Leave nothing behind: not what was staged, nor a folder that was made for it and is empty."""
@@ -254,9 +244,15 @@ def _read_commit(path: Path) -> Manifest:
         ) from error
 
 
-def _unwritable(out: Path, error: OSError | ValueError) -> WriteError:
-    expected = "a folder that can be made or written to, with free space"
-    return WriteError(f"{out}: cannot be written ({reason(error)}); expected {expected}")
+@contextlib.contextmanager
+def _writing(
+    out: Path, more: str = "expected a folder that can be made or written to, with free space"
+) -> Iterator[None]:
+    """Raise `WriteError` in place of what the body raises where a folder cannot be written."""
+    try:
+        yield
+    except (OSError, ValueError) as error:  # ValueError: a NUL in the path
+        raise WriteError(f"{out}: cannot be written ({reason(error)}); {more}") from error
 
 
 def _move_aside(path: Path, run_id: str) -> None:
@@ -322,10 +318,8 @@ def _open_folder(folder: Path) -> int:
 def _locked(folder: Path) -> Iterator[None]:
     """Keep other processes from moving files in a folder, if its file system has locks."""
     deadline = time.monotonic() + _PATIENCE
-    try:
+    with _writing(folder):
         lock = _open_folder(folder)
-    except OSError as error:
-        raise _unwritable(folder, error) from error
     try:
         while try_lock(lock) is False:
             if time.monotonic() > deadline:

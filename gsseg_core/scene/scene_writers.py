@@ -96,8 +96,7 @@ def format_of(path: str | os.PathLike[str], asked: str | None = None) -> str:
         check_format(asked)
     file = Path(path).name.lower()
     fits = {suffix: name for name, writer in SCENE_WRITERS.items() for suffix in writer.suffixes}
-    suffix = max(filter(file.endswith, fits), key=len, default=None)
-    by_suffix = None if suffix is None else fits[suffix]
+    by_suffix = fits.get(max(filter(file.endswith, fits), key=len, default=""))
     if by_suffix is None:
         only_read = next((known.name for known in SCENE_FORMATS if file.endswith(known.suffixes)), None)
         if only_read or file.endswith(_FOREIGN):
