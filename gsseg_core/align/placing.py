@@ -117,34 +117,34 @@ def find_alignment(
     conventions alone. Taken is the first alignment by which photos and renderings lie upon each other, or else the one
     that agrees best. Raises `AlignmentError` where none agrees.
     """
-    search = _Search(scene, views, settings or AlignSettings(), device)
-    before = agreement(scene, search.shown, search.settings, device)
+    settings = settings or AlignSettings()
+    shown = look_at(views, settings)
+    before = agreement(scene, shown, settings, device)
     if before is None:
         raise AlignmentError(
             "alignment: no view has a photo, or a mask with outlines; expected some, to see where cameras are by them"
         )
-    photos = before.compared == "photos"
-    agreeing: list[Found] = []
+    search, agreeing = _Search(scene, views, shown, before, settings, device), list[Found]()
     # Masks say less than photos do: the regions of a shelf may agree from a wrong side, too.
-    if before.agrees and photos:
-        as_they_are = search.closer(Found(Alignment(), before, before))
+    if before.agrees and search.has_photos:
+        as_they_are = search.closer(Alignment(), before)
         # Agreement alone is not enough: all sides of a table look alike.
         if as_they_are.offset_px is not None and as_they_are.offset_px <= _CLOSE_PX:
             return as_they_are
         agreeing.append(as_they_are)
-    alignment = Alignment(find_convention(scene, search.shown, search.settings, device, progress))
+    alignment = Alignment(find_convention(scene, shown, settings, device, progress))
     if (reached := search.through(alignment)).agrees:
-        by_convention = search.closer(Found(alignment, reached, before))
-        if by_convention.offset_px is None or by_convention.offset_px <= search.settings.reprojection_px:
+        by_convention = search.closer(alignment, reached)
+        if by_convention.offset_px is None or by_convention.offset_px <= settings.reprojection_px:
             return by_convention
         agreeing.append(by_convention)
-    if not photos:
+    if not search.has_photos:
         raise AlignmentError(
             f"alignment: no convention of axes has scene and masks agree ({reached} at best); expected photos of the "
             "views in images/, by which scale, rotation and translation can be found, too"
         )
     try:
-        agreeing.append(search.registered(before, progress))
+        agreeing.append(search.registered(progress))
     except AlignmentError:
         if not agreeing:
             raise
@@ -157,20 +157,22 @@ class _Search:
 
     scene: GaussianScene
     views: Sequence[View]
+    shown: list[Shown]  # by some of the views, at least one
+    before: Agreement  # of the scene with these, with the cameras where they were
     settings: AlignSettings
     device: str
 
-    @cached_property
-    def shown(self) -> list[Shown]:
-        """What some of the views show."""
-        return look_at(self.views, self.settings)
+    @property
+    def has_photos(self) -> bool:
+        """Whether views show photos, and not masks."""
+        return self.before.compared == "photos"
 
     @cached_property
     def photos(self) -> PhotosInScene:
         """Photos that renderings are matched with."""
         return PhotosInScene.read(self.views, self.scene, self.settings, self.device)
 
-    def registered(self, before: Agreement, progress: Progress) -> Found:
+    def registered(self, progress: Progress) -> Found:
         """Find a similarity by the photos."""
         from gsseg_core.align.refinement import offset_px, refined
         from gsseg_core.align.registration import candidates
@@ -181,29 +183,29 @@ class _Search:
             if reached.agrees:
                 count = self.settings.virtual_views
                 progress("look for photos in the scene", count, count)
-                return Found(alignment, reached, before, offset_px(self.photos, alignment))
+                return Found(alignment, reached, self.before, offset_px(self.photos, alignment))
         raise AlignmentError(
             f"alignment: no place in the scene looks as the {len(self.photos.photos)} photos do; expected photos of "
             "this scene, with structure, and poses that differ from the scene's by a convention, a scale, a rotation "
             "and a translation"
         )
 
-    def closer(self, found: Found) -> Found:
+    def closer(self, alignment: Alignment, reached: Agreement) -> Found:
         """Refine an alignment by the photos, if there are any and they are not yet close to the renderings."""
-        if found.agreement.compared != "photos":
-            return found
+        if not self.has_photos:
+            return Found(alignment, reached, self.before)
         from gsseg_core.align.refinement import offset_px, refined
 
-        offset = offset_px(self.photos, found.alignment)
+        offset = offset_px(self.photos, alignment)
         if offset is not None and offset > _CLOSE_PX:
-            alignment = refined(self.photos, found.alignment)
-            closer = offset_px(self.photos, alignment)
-            if closer is not None and closer < offset:
-                return Found(alignment, self.through(alignment), found.before, closer)
-        return replace(found, offset_px=offset)
+            closer = refined(self.photos, alignment)
+            closer_px = offset_px(self.photos, closer)
+            if closer_px is not None and closer_px < offset:
+                return Found(closer, self.through(closer), self.before, closer_px)
+        return Found(alignment, reached, self.before, offset)
 
     def through(self, alignment: Alignment) -> Agreement:
-        """Compare the scene with the views, at least one, after their cameras are moved."""
+        """Compare the scene with what views show, after their cameras are moved."""
         moved = [replace(view, camera=alignment.camera(view.camera)) for view in self.shown]
         compared = agreement(self.scene, moved, self.settings, self.device)
         assert compared is not None

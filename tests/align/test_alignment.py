@@ -228,7 +228,7 @@ def test_a_table_seen_from_another_side_is_not_taken_for_right_because_it_looks_
 def test_where_photos_and_renderings_lie_upon_each_other_nowhere_what_agrees_best_is_taken(
     with_photos: Path, scene: GaussianScene, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(placing._Search, "closer", lambda _, found: replace(found, offset_px=29.0))
+    monkeypatch.setattr(placing._Search, "closer", lambda search, *found: Found(*found, search.before, 29.0))
     asked = []
 
     def nowhere(*_: object) -> Found:
