@@ -27,6 +27,7 @@ from gsseg_core.kernels.compiler import kernel
 from gsseg_core.learn.learner import Learner
 from gsseg_core.learn.temperature import VIEWS, Sample, grid_of, sample_grid
 from gsseg_core.progress import Progress, silent
+from gsseg_core.raster.view_renderer import NO_PIXELS
 from gsseg_core.scene.camera import Camera
 from gsseg_core.several_at_once import each_with_made, several_at_once
 
@@ -152,10 +153,13 @@ class MaskChecker:
 
     def _check(self, view: View) -> ViewCheck:
         """Compare a view's mask with what is predicted where it says something."""
-        learner, seen = self.learner, view.read_seen()
+        learner, seen, is_sampled = self.learner, view.read_seen(), view.name in self._sampled
         wanted = _compared(seen.labels)
-        sampled = view.name in self._sampled
-        predicted = self._predict(view, seen, wanted) if sampled else learner.strongest_without(view, wanted).labels()
+        grid = grid_of(view.camera.height, view.camera.width) if is_sampled else NO_PIXELS
+        found = learner.strongest_without(view, wanted, grid)
+        if is_sampled:
+            self._samples[view.name] = sample_grid(found.on_grid, grid.of(np.where(wanted, seen.named(), UNKNOWN)))
+        predicted = found.labels()
         predicted[~wanted] = UNKNOWN
         check = compare_mask(view, predicted, learner.num_classes, seen)
         return replace(check, rejected=learner.rejected_share(view))
@@ -164,13 +168,6 @@ class MaskChecker:
         """Tell the class of each pixel of a view that is shown, also where nothing is compared."""
         labelled = view.read_seen().labels >= 0
         return PackedLabels(self.learner.strongest_without(view, labelled if labelled.all() else None).labels())
-
-    def _predict(self, view: View, seen: SeenLabels, wanted: np.ndarray) -> np.ndarray:  # (H, W) bool
-        """Tell the class of each pixel that is compared, (H, W) int32, and keep the probabilities of some."""
-        grid = grid_of(view.camera.height, view.camera.width)
-        found = self.learner.strongest_without(view, wanted, grid)
-        self._samples[view.name] = sample_grid(found.on_grid, grid.of(np.where(wanted, seen.named(), UNKNOWN)))
-        return found.labels()
 
 
 def _is_of_all(check: ViewCheck, camera: Camera) -> bool:
