@@ -8,6 +8,7 @@ int64 in units of `GRADIENT_UNIT`, and a `prior`, (Z,) float32 in px. The `likel
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from functools import partial
 from typing import Any, TypeVar
 
 import numba as nb
@@ -190,11 +191,7 @@ def confusion_counts(
     codes: CSRRows, pairs: ViewPairs, shares: np.ndarray, num_classes: int, num_labels: int
 ) -> np.ndarray:
     """Sum over the pairs of codes[m] times share, by class and label, (K, L) float64; row m is of `pairs.ids[m]`."""
-
-    def count(first: int, parts: np.ndarray) -> None:
-        _count_confusions(codes, pairs, shares, first, parts)
-
-    return _in_parts((num_classes, num_labels), count)
+    return _in_parts((num_classes, num_labels), partial(_count_confusions, codes, pairs, shares))
 
 
 def _in_parts(shape: tuple[int, int], count: Callable[[int, np.ndarray], None]) -> np.ndarray:
@@ -245,10 +242,7 @@ def leave_one_out_counts(
     Gaussian counts at most `most` times the pixels that the other views saw of it.
     """
     pairs, own, class_ids = pairs_of(observation), observation.votes(), np.flatnonzero(possible)
-
-    def count(first: int, parts: np.ndarray) -> None:
-        _count(votes, pairs, own, evidence.votes, class_ids, power, most, first, parts)
-
+    count = partial(_count, votes, pairs, own, evidence.votes, class_ids, power, most)
     return _in_parts((len(possible), evidence.votes.num_rows), count)
 
 
