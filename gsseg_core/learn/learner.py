@@ -133,7 +133,7 @@ class Learner(ABC):
         if self.memory_budget == 0 and view.name not in self.views:
             view = view.held()
             try:
-                sees = self._lift(view, read_usable_mask(view, self.num_classes), 1, operator)
+                sees = self._lift(view, 1, operator, read_usable_mask(view, self.num_classes))
             except UnusableViewError as why:
                 return self._add(view, why)
             return self._add(view, None if sees else UnusableViewError(SEES_NOTHING))
@@ -161,7 +161,7 @@ class Learner(ABC):
         if observation is not None:
             observation.vote(self._votes, sign=-1)
         else:
-            self._lift(view, read_mask(view, self.num_classes), -1)
+            self._lift(view, -1)
         self.forget(name)
 
     def forget(self, name: str) -> None:
@@ -299,10 +299,15 @@ class Learner(ABC):
             raise SettingsError(f"view {name!r} was not observed; there are {len(self.views)} others")
         return self.views[name]
 
-    def _lift(self, view: View, seen: SeenLabels, sign: int, operator: ViewOperator | None = None) -> bool:
-        """Add a view's votes, or take them away, and keep nothing of it; tell whether it sees any Gaussian."""
+    def _lift(
+        self, view: View, sign: int, operator: ViewOperator | None = None, seen: SeenLabels | None = None
+    ) -> bool:  # fmt: skip
+        """Add a view's votes, or take them away, and keep nothing of it; tell whether it sees any Gaussian.
+
+        Its operator is made, and its mask is read, unless they are at hand.
+        """
         operator = operator or self._operator_of(view)
-        used = self._used_labels(seen, operator)
+        used = self._used_labels(seen or read_mask(view, self.num_classes), operator)
         return operator.vote(used.labels, used.evidence, self._votes, sign=sign)
 
     def _opened(self, view: View, operator: ViewOperator | None = None) -> tuple[View, Observation | UnusableViewError]:

@@ -11,7 +11,6 @@ from gsseg_core.data.view import View
 from gsseg_core.learn.all_or_nothing import Undo, all_or_nothing, checkpoint
 from gsseg_core.learn.learner import Learner, Progress, silent
 from gsseg_core.learn.learner_state import State
-from gsseg_core.learn.usable_views import read_mask
 from gsseg_core.raster.view_operator import ViewOperator
 from gsseg_core.scene.camera import Camera
 
@@ -71,10 +70,9 @@ class VoteLearner(Learner):
 
     def _exchange(self, before: View, after: View, operator: ViewOperator | None = None) -> None:
         """Put a view in the place of one of its name, seen by the same operator if one is given."""
-        new, old = (read_mask(view, self.num_classes) for view in (after, before))
-        self._lift(after, new, 1, operator)
-        with all_or_nothing(partial(self._lift, after, new, -1, operator)):
-            self._lift(before, old, -1, operator)
+        self._lift(after, 1, operator)
+        with all_or_nothing(partial(self._lift, after, -1, operator)):
+            self._lift(before, -1, operator)
         self.views[after.name] = after
         self._prepared.drop(after.name)
 

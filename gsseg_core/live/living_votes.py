@@ -9,11 +9,11 @@ from weakref import WeakKeyDictionary
 
 import numpy as np
 
+from gsseg_core.csr_rows import CSRRows
 from gsseg_core.data.view import View
 from gsseg_core.errors import UnknownGroupError
 from gsseg_core.learn.all_or_nothing import all_or_nothing, checkpoint
 from gsseg_core.learn.learner_state import State
-from gsseg_core.learn.usable_views import read_mask
 from gsseg_core.learn.vote_learner import VoteLearner
 from gsseg_core.live.scene_change import SceneChange
 from gsseg_core.raster.backends import make_operator
@@ -64,18 +64,14 @@ class LivingVotes(VoteLearner):
         ]
         # To take a view back costs as much as to add it: with more than half of them, all are lifted from nothing.
         from_nothing = all_kept and 2 * len(lifted) > len(views)
-        names = list(views) if from_nothing else lifted
-        order = along_curve(change.after.scene)
         taken_back = [] if from_nothing else lifted
         self._lift_all(self.views, taken_back, -1)
         # With too little memory the scene stays, and with it its votes.
         with all_or_nothing(checkpoint(self), partial(self._lift_all, self.views, taken_back, 1)):
-            if from_nothing:
-                self._votes = VoteTotal(len(change.after), self.num_classes, order)
-            else:
-                self._votes = VoteTotal.from_rows(change.carry(self._votes.rows()), self.num_classes, order)
+            stay = CSRRows.empty(len(change.after), np.int64) if from_nothing else change.carry(self._votes.rows())
+            self._votes = VoteTotal.from_rows(stay, self.num_classes, along_curve(change.after.scene))
             self.living, self.scene = change.after, change.after.scene
-            self._lift_all(views, names, 1)
+            self._lift_all(views, list(views) if from_nothing else lifted, 1)
         self.views = views
         for name in lifted:
             self._ends.pop(views[name], None)
@@ -95,16 +91,12 @@ class LivingVotes(VoteLearner):
     def _lift_all(self, views: Mapping[str, View], names: list[str], sign: int) -> None:
         """Add the votes of some views, or take them away; of all, or on any error of none."""
         done = list[str]()
-        try:
+        with all_or_nothing(lambda: self._lift_all(views, done, -sign)):
             # In the order of groups, so that the scene is brought into the frame of each but once.
             for name in sorted(names, key=lambda name: str(views[name].group)):
                 # A view that sees nothing any more is kept: it may see what is added later.
-                self._lift(views[name], read_mask(views[name], self.num_classes), sign)
+                self._lift(views[name], sign)
                 done.append(name)
-        except BaseException:
-            for name in done:
-                self._lift(views[name], read_mask(views[name], self.num_classes), -sign)
-            raise
 
     def _joined(self, view: View, group: int | None) -> View:
         """Have a view belong to a group: it stays where it is in the scene, and from then on moves along."""
