@@ -175,14 +175,14 @@ class _Search:
     def registered(self, progress: Progress) -> Found:
         """Find a similarity by the photos."""
         from gsseg_core.align.refinement import offset_px, refined
-        from gsseg_core.align.registration import candidates
+        from gsseg_core.align.registration import LOOKING, candidates
 
         for guess in candidates(self.photos, progress):
             alignment = refined(self.photos, guess)
             reached = self.through(alignment)
             if reached.agrees:
                 count = self.settings.virtual_views
-                progress("look for photos in the scene", count, count)
+                progress(LOOKING, count, count)
                 return Found(alignment, reached, self.before, offset_px(self.photos, alignment))
         raise AlignmentError(
             f"alignment: no place in the scene looks as the {len(self.photos.photos)} photos do; expected photos of "

@@ -23,8 +23,8 @@ _SEARCH_PX = (40.0, 12.0, 6.0)  # how far from its place a feature is looked for
 _LEAST = 20  # matches from which seven numbers are fitted
 
 
-class _Correspondences(NamedTuple):
-    """Pixels of photos with their points in the scene, and the cameras of the photos."""
+class _Matches(NamedTuple):
+    """Pixels of photos, the points of the scene that they match, and the cameras of the photos."""
 
     rotations: np.ndarray  # (P, 3, 3): of the photo's camera, world to camera
     translations: np.ndarray  # (P, 3)
@@ -43,7 +43,7 @@ def refined(photos: PhotosInScene, alignment: Alignment) -> Alignment:
     """Fit the similarity of an alignment to all photos; where hardly anything matches, it is returned as it was."""
     for step in range(photos.settings.refinements):
         found = _match(photos, photos.photos, alignment, _SEARCH_PX[min(step, len(_SEARCH_PX) - 1)])
-        if len(found.pixels) < _LEAST:
+        if found is None:
             return alignment
         alignment = Alignment(alignment.convention, _fit(found).inverse().after(alignment.similarity))
     return alignment
@@ -52,11 +52,11 @@ def refined(photos: PhotosInScene, alignment: Alignment) -> Alignment:
 def offset_px(photos: PhotosInScene, alignment: Alignment) -> float | None:
     """How far some photos and renderings are apart, in px of the photos as matched: median over features of both."""
     found = _match(photos, spread(photos.photos, photos.settings.views), alignment, _SEARCH_PX[0])
-    return float(np.median(np.linalg.norm(found.errors(found.points), axis=1))) if len(found.pixels) >= _LEAST else None
+    return None if found is None else float(np.median(np.linalg.norm(found.errors(found.points), axis=1)))
 
 
-def _match(photos: PhotosInScene, some: Sequence[Photo], alignment: Alignment, within_px: float) -> _Correspondences:
-    """Match some of the photos with what the scene looks like from their cameras."""
+def _match(photos: PhotosInScene, some: Sequence[Photo], alignment: Alignment, within_px: float) -> _Matches | None:
+    """Match some of the photos with renderings of the scene from their cameras; None if hardly anything matches."""
     rows = []
     for camera, features in some:
         moved = alignment.camera(camera)
@@ -68,12 +68,12 @@ def _match(photos: PhotosInScene, some: Sequence[Photo], alignment: Alignment, w
         lens = np.array([moved.fx, moved.fy, moved.cx, moved.cy])
         repeated = (np.repeat(each[None], len(pairs), axis=0) for each in (pose[:3, :3], pose[:3, 3], lens))
         rows.append((*repeated, features.pixels[pairs[:, 0]], rendering.points[pairs[:, 1]]))
-    if not rows:
-        return _Correspondences(*(np.zeros((0, *shape)) for shape in ((3, 3), (3,), (4,), (2,), (3,))))
-    return _Correspondences(*(np.concatenate(column) for column in zip(*rows, strict=True)))
+    if sum(len(pixels) for *_, pixels, _ in rows) < _LEAST:
+        return None
+    return _Matches(*(np.concatenate(column) for column in zip(*rows, strict=True)))
 
 
-def _fit(found: _Correspondences) -> Similarity:
+def _fit(found: _Matches) -> Similarity:
     """Fit the similarity that moves points of the scene to where the cameras see their pixels."""
     middle = np.median(found.points, axis=0)
     size = max(float(np.median(np.abs(found.points - middle))), 1e-9)

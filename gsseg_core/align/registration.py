@@ -17,13 +17,13 @@ from typing import NamedTuple
 import numpy as np
 
 from gsseg_core.align.conventions import AXIS_ROTATIONS, Alignment, Convention
-from gsseg_core.align.features import Features, Photo, PhotosInScene, matches
-from gsseg_core.align.settings import AlignSettings
-from gsseg_core.progress import Progress
+from gsseg_core.align.features import Photo, PhotosInScene, matches
+from gsseg_core.progress import Progress, with_progress
 from gsseg_core.scene.camera import Camera, pose_looking
 from gsseg_core.scene.gaussian_scene import GaussianScene
 from gsseg_core.scene.similarity import Similarity
 
+LOOKING = "look for photos in the scene"  # what progress calls it
 _SHELLS = (1.6, 1.0, 0.0, 2.5)  # radii of the scene at which it is looked at from outside; 0: from inside
 _SOLID = 0.3  # opacity from which on a Gaussian counts for the size of the scene
 # By how much a located camera may differ from the similarity's: its angle; its centre, of the extent of all centres.
@@ -41,18 +41,14 @@ def candidates(photos: PhotosInScene, progress: Progress) -> Iterator[Alignment]
     """Guess alignments, each from other photos than the last; most guesses are right, to a few px."""
     if len(photos.photos) < 2:
         return
-    count = photos.settings.virtual_views
-    for done, camera in enumerate(virtual_cameras(photos.scene, photos.photos[0].camera, count)):
-        progress("look for photos in the scene", done, count)
-        found = locate(photos.photos, photos.rendering(camera), photos.settings)
+    cameras = list(virtual_cameras(photos.scene, photos.photos[0].camera, photos.settings.virtual_views))
+    for camera in with_progress(progress, LOOKING, cameras):
+        found = locate(photos, camera)
         for _ in range(2):  # from where the surest one was taken, the scene looks like it
-            if not found:
-                break
-            surest = max(found.values(), key=lambda located: located.inliers)
-            found = locate(photos.photos, photos.rendering(surest.camera), photos.settings)
+            if found:
+                found = locate(photos, max(found.values(), key=lambda located: located.inliers).camera)
         if len(found) > 1 and (guess := fit_poses(photos.photos, found)) is not None:
             yield guess
-    progress("look for photos in the scene", count, count)
 
 
 def virtual_cameras(scene: GaussianScene, like: Camera, count: int) -> Iterator[Camera]:
@@ -70,16 +66,17 @@ def virtual_cameras(scene: GaussianScene, like: Camera, count: int) -> Iterator[
         yield replace(like, world_to_camera=pose_looking(-away, -up, place))
 
 
-def locate(photos: Sequence[Photo], rendering: Features, settings: AlignSettings) -> dict[int, Located]:
-    """Locate photos, by their numbers, of which the rendering shows enough."""
+def locate(photos: PhotosInScene, camera: Camera) -> dict[int, Located]:
+    """Locate photos, by their numbers, of which the scene shows enough from a camera."""
     import pycolmap
 
+    rendering, settings = photos.rendering(camera), photos.settings
     options = pycolmap.AbsolutePoseEstimationOptions()
     options.ransac.max_error = settings.reprojection_px
     options.ransac.random_seed = 0
     options.ransac.max_num_trials = 2000
     found = {}
-    for number, (camera, features) in enumerate(photos):
+    for number, (camera, features) in enumerate(photos.photos):
         pairs = matches(features, rendering, settings.ratio)
         if len(pairs) < settings.matches or rendering.points is None:
             continue
