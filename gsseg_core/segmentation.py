@@ -28,7 +28,7 @@ from gsseg_core.raster.view_operator import ViewOperator
 from gsseg_core.raster.view_renderer import Blended
 from gsseg_core.refine.knn_filter import before_clustering, cluster, statistical_filter
 from gsseg_core.refine.settings import RefineSettings
-from gsseg_core.refine.silhouette_carving import Silhouette, carve
+from gsseg_core.refine.silhouette_carving import Silhouette, kept_shares, sticking_out
 from gsseg_core.scene.camera import Camera
 from gsseg_core.scene.gaussian_scene import GaussianScene
 from gsseg_core.spatial.neighbourhood import neighbours_of
@@ -294,7 +294,7 @@ class Segmentation:
         Of each, `look` tells what it shows.
         """
         self.require(scene)
-        return self._without(carve(scene, self.labels, views, look, device=device))
+        return self._without(sticking_out(kept_shares(scene, self.labels, views, look, device=device), self.labels))
 
     def label_map(self, operator: ViewOperator) -> np.ndarray:
         """Class of every pixel of a view, (H, W) int32: those of `render`, without the confidence."""

@@ -99,7 +99,8 @@ def kept_shares(
 ) -> np.ndarray:
     """Find how much of each Gaussian its object should keep: (N,) float64, 0.01 to 1.
 
-    It is 1 where there is no object or no view says anything.
+    It is 1 where there is no object or no view says anything, and depends neither on the order of the Gaussians nor on
+    the number of threads.
     """
     labels = np.ascontiguousarray(labels, np.int32)
     go, kept = np.zeros(len(scene)), np.ones(len(scene))
@@ -161,21 +162,6 @@ class _Shown(NamedTuple):
     camera: Camera
     labels: np.ndarray  # (H, W) int32
     stands_for: float
-
-
-def carve(
-    scene: GaussianScene,
-    labels: np.ndarray,
-    views: Iterable[T],
-    look: Callable[[T], Silhouette],
-    *,
-    device: str = "cpu",
-) -> np.ndarray:
-    """Find the Gaussians that stick out of their objects, (N,) bool; takes what `kept_shares` takes.
-
-    Results depend neither on the order of the Gaussians nor on the number of threads.
-    """
-    return sticking_out(kept_shares(scene, labels, views, look, device=device), labels)
 
 
 def sticking_out(kept: np.ndarray, labels: np.ndarray) -> np.ndarray:  # (N,), (N,) int32

@@ -60,7 +60,7 @@ def shares_of(scene: GaussianScene, labels: np.ndarray, views: list[Silhouette],
 
 
 def carve(scene: GaussianScene, labels: np.ndarray, views: list[Silhouette]) -> np.ndarray:
-    return silhouette_carving.carve(scene, labels, views, lambda shown: shown)
+    return sticking_out(kept_shares(scene, labels, views, lambda shown: shown), labels)
 
 
 def scores(labels: np.ndarray, scene: GaussianScene = SCENE, turn: float = 0.3) -> ObjectScores:
@@ -166,7 +166,7 @@ def test_who_looks_at_a_view_weighs_it_too(monkeypatch: pytest.MonkeyPatch) -> N
         return shown
 
     monkeypatch.setattr(TileObjects, "reasons_to_go", weigh_here)
-    np.testing.assert_array_equal(silhouette_carving.carve(scene, labels, silhouettes(), look), expected)
+    np.testing.assert_array_equal(sticking_out(kept_shares(scene, labels, silhouettes(), look), labels), expected)
     assert sorted(looked) == sorted(weighed) and threading.get_ident() not in weighed
 
 
