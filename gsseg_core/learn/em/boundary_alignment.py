@@ -91,10 +91,10 @@ def _align_regions(labels: np.ndarray, edges: np.ndarray, farthest: int) -> _Ali
     other, ring = _nearest_regions(region, most + 1)
     pairs, pair, lengths, strengths = _boundary_strengths(region, other, ring, edges, len(area), most + 1)
     moving = lengths[:, most : most + 2].min(axis=1) >= SHORTEST
-    along, weights = _lengths_and_weights(lengths)
+    along = np.maximum(lengths[:, most] + lengths[:, most + 1], 1)  # px of both sides
+    weights = SHARPNESS * np.sqrt(np.minimum(along, LONGEST) / LENGTH)  # nats that edges of one unit are worth
+    log_likelihood = _edge_log_likelihood(lengths[moving], strengths[moving], weights[moving])
     beside = np.flatnonzero((ring.ravel() == 1) & np.append(moving, False)[pair])
-    weights = (weights / along)[pair[beside]]
-    log_likelihood = _edge_log_likelihood(lengths[moving], strengths[moving])
     still = float(log_likelihood[:, most].sum())
     near = slice(farthest, 3 * farthest)  # a boundary may lie this far from its edge
     tells = bool(strengths[:, near].sum() >= TELLING * sampled(edges).mean() * lengths[:, near].sum())
@@ -105,7 +105,7 @@ def _align_regions(labels: np.ndarray, edges: np.ndarray, farthest: int) -> _Ali
             evidence = of_shifts
             moved = np.where(moving, np.clip(shifts[pairs[:, 0]] - shifts[pairs[:, 1]], -most, most), 0)
             _move(region, other, ring, pair, pairs, moved, labels.ravel()[first], aligned)
-    return _Alignment(aligned, evidence, tells, beside, weights)
+    return _Alignment(aligned, evidence, tells, beside, (weights / along)[pair[beside]])
 
 
 def _shifts(touching: np.ndarray, log_likelihood: np.ndarray, count: int, farthest: int) -> tuple[np.ndarray, float]:
@@ -134,21 +134,14 @@ def _shifts(touching: np.ndarray, log_likelihood: np.ndarray, count: int, farthe
     return found, float(of_pairs + of_shifts)
 
 
-def _lengths_and_weights(lengths: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Pixels along each boundary, of both sides, (P,), and what edges of one unit are worth there, (P,), in nats."""
-    middle = lengths.shape[1] // 2
-    along = np.maximum(lengths[:, middle - 1] + lengths[:, middle], 1)
-    return along, SHARPNESS * np.sqrt(np.minimum(along, LONGEST) / LENGTH)
-
-
-def _edge_log_likelihood(lengths: np.ndarray, strengths: np.ndarray) -> np.ndarray:
+def _edge_log_likelihood(lengths: np.ndarray, strengths: np.ndarray, weights: np.ndarray) -> np.ndarray:
     """Log-likelihood of boundaries moved by -(2 S - 1) to 2 S - 1 px, (P, 4 S - 1), in nats.
 
-    Lengths and strengths, (P, 4 S), are those of `_boundary_strengths`.
+    Lengths and strengths, (P, 4 S), are those of `_boundary_strengths`; weights, (P,), are of edges of one unit.
     """
     there = np.minimum(lengths[:, 1:], lengths[:, :-1]) >= SHORTEST
     mean = (strengths[:, 1:] + strengths[:, :-1]) / np.maximum(lengths[:, 1:] + lengths[:, :-1], 1)
-    return np.where(there, _lengths_and_weights(lengths)[1][:, None] * mean, VANISHED)
+    return np.where(there, weights[:, None] * mean, VANISHED)
 
 
 @kernel
