@@ -54,8 +54,10 @@ def renamed_note(
     renamed: Sequence[Mapping[str, str]], per_view: str, label_map: str, written: Callable[[str], str] = clipped
 ) -> str:
     """Say in a sentence without its stop what a `renamed_report` lists, and which two settings help; "" for nothing."""
+    if not renamed:
+        return ""
     pairs = listed((f"{entry['name']} ({entry['others_say']})" for entry in renamed), NOTED, written)
-    return bool(renamed) * (
+    return (
         f"other views call {counted(len(renamed), 'id')} by another that no mask shows beside it: {pairs}. Did a "
         f"tracker lose objects and name them anew, or are there two names for one thing? {per_view} finds objects "
         f"whatever their ids are, and {label_map} puts names together"

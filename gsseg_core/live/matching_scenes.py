@@ -80,7 +80,7 @@ def _nearest(before: np.ndarray, after: np.ndarray, tolerance: float) -> np.ndar
     distances, found = cKDTree(before).query(after, distance_upper_bound=bound)
     found = np.where(distances <= tolerance, found, -1)
     # The nearest one keeps a point that several have found; of equally near ones, the first.
-    order = np.lexsort((np.arange(len(after)), distances))
+    order = np.argsort(distances, kind="stable")
     order = order[found[order] >= 0]
     _, first = np.unique(found[order], return_index=True)
     origin = np.full(len(after), -1, np.int64)
