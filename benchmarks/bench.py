@@ -9,7 +9,6 @@ repository). The numbers are compared with those of the BENCHMARK.json that is t
 
 from __future__ import annotations
 
-import argparse
 import shutil
 import statistics
 import sys
@@ -22,7 +21,7 @@ from typing import Any
 
 from children import ChildError, finish, run_child, seconds_of
 from growth import add_growth
-from machine import DATA, REPOSITORY, describe
+from machine import REPOSITORY, describe, parser_of
 from peers import LOOP, add_flashsplat, add_others, add_torch_loop
 from report import Bar, Report
 from workloads import MASKS, REAL, SIZES, Sizes
@@ -33,10 +32,9 @@ IMPORT = "import gsseg_core"
 
 def main() -> int:
     """Measure and write."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = parser_of(__doc__)
     parser.add_argument("--quick", action="store_true", help="the same as --sizes quick")
     parser.add_argument("--sizes", choices=SIZES, default="full", help="how much to measure; tiny only tries it out")
-    parser.add_argument("--data", type=Path, default=DATA, help="folder of the real scenes")
     parser.add_argument("--out", type=Path, help="gets both files [the repository if full, else results_out/]")
     options = parser.parse_args()
     sizes = SIZES["quick" if options.quick else options.sizes]

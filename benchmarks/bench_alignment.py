@@ -8,15 +8,14 @@ land in the views. A row is printed as soon as it is known, with the CPU time th
 
 from __future__ import annotations
 
-import argparse
-import os
 import time
 from collections.abc import Iterator
 from dataclasses import replace
-from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
+from machine import parser_of
+from scenes import REAL
 from scipy.spatial.transform import Rotation
 
 from gsseg_core.align.conventions import AXIS_ROTATIONS, OPENGL, Alignment, Convention
@@ -26,7 +25,7 @@ from gsseg_core.errors import AlignmentError
 from gsseg_core.scene.gaussian_scene import GaussianScene
 from gsseg_core.scene.similarity import Similarity
 
-SCENES = ("replica_apartment", "shelf", "kitchen_table", "workbench", "fern")
+SCENES = (*REAL, "fern")
 SIMILARITIES = 2
 POINTS = 2000  # of the scene, whose places in the views are compared
 
@@ -88,15 +87,15 @@ def measure(scene: GaussianScene, true: Dataset, name: str, disturbed: Alignment
 
 def main() -> None:
     """Print the table of some scenes, all by default."""
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser = parser_of(__doc__)
     parser.add_argument("scenes", nargs="*", default=SCENES)
     parser.add_argument("--every", type=int, default=1, help="take only each so many-th disturbance, and the last")
     options = parser.parse_args()
-    data = Path(os.environ.get("GSSEG_DATA") or Path(__file__).resolve().parents[2] / "shared/data")
     print(f"{'disturbance':28} {'by':7} {'':10} {'median px':>9} {'worst px':>8} {'CPU s':>7}")
     for number, name in enumerate(options.scenes):
         print(f"\n{name}", flush=True)
-        scene, true = GaussianScene.load(data / name / "scene.ply"), Dataset(data / name, "labels_noisy")
+        folder = options.data / name
+        scene, true = GaussianScene.load(folder / "scene.ply"), Dataset(folder, "labels_noisy")
         rows, tried = [], list(disturbances(number))
         for label, disturbed, by_masks in [*tried[: -1 : options.every], tried[-1]]:
             ways = [True, *([False] if by_masks and true.views("train")[0].has_mask else [])]

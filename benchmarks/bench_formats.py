@@ -10,8 +10,6 @@ Segmentation: each scene is written, read again, learnt from its noisy masks and
 
 from __future__ import annotations
 
-import argparse
-import os
 import statistics
 import tempfile
 import time
@@ -21,14 +19,13 @@ from pathlib import Path
 import gaussforge
 import numpy as np
 import torch
-from machine import processor
-from results import markdown, score
+from machine import parser_of, processor
+from results import markdown, score, segmented
 
 from gsseg_core.data.dataset import Dataset
 from gsseg_core.learn.registry import make_learner
 from gsseg_core.scene.gaussian_scene import GaussianScene
 from gsseg_core.scene.scene_writers import write_scene
-from gsseg_core.segmentation import Segmentation
 
 Write = Callable[[GaussianScene, Path], None]
 RUNS = 5
@@ -68,9 +65,7 @@ FORMATS: dict[str, tuple[str, Write, float, float | None]] = {
 
 def main() -> None:
     """Measure and print both tables."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    data = os.environ.get("GSSEG_DATA") or Path(__file__).resolve().parents[2] / "shared/data"
-    parser.add_argument("--data", default=data, type=Path)
+    parser = parser_of(__doc__)
     parser.add_argument("--scenes", nargs="*", default=["shelf", "kitchen_table", "workbench", "replica_apartment"])
     parser.add_argument("--learner", default="em")
     parser.add_argument("--count", default=1_000_000, type=int)
@@ -133,10 +128,8 @@ def segmenting(folders: list[Path], learner: str) -> str:
 def mean_iou(scene: GaussianScene, folder: Path, name: str) -> float:
     data = Dataset(folder, "labels_noisy")
     learner = make_learner(name, scene, data.num_classes)
-    for view in data.views("train"):
-        learner.observe(view)
-    result = Segmentation.from_codes(scene, learner.fit().codes_, data.class_names, evidence=learner.evidence())
-    return score(result, scene, Dataset(folder).views("test")).mean_iou
+    learner.observe_all(data.views("train"))
+    return score(segmented(learner.fit(), data.class_names), scene, Dataset(folder).views("test")).mean_iou
 
 
 if __name__ == "__main__":

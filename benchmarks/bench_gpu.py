@@ -8,14 +8,12 @@ Runs on a room of benchmarks/room.py, and on FOLDER/replica_apartment where that
 
 from __future__ import annotations
 
-import argparse
 import importlib
 import sys
 from collections.abc import Sequence
-from pathlib import Path
 
 import numpy as np
-from machine import DATA, asked_anew, once, processor, timed, version
+from machine import asked_anew, once, parser_of, processor, timed, version
 from room import build_room
 
 from gsseg_core.data.dataset import Dataset
@@ -31,11 +29,10 @@ SAMPLED = 5
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    parser = argparse.ArgumentParser(description="Compare the CPU with a GPU.")
+    parser = parser_of(__doc__)
     parser.add_argument("--device", default="cuda")
     parser.add_argument("--views", type=int, default=60)
     parser.add_argument("--gaussians", type=int, default=1_000_000)
-    parser.add_argument("--data", type=Path, default=DATA)
     options = parser.parse_args(arguments)
     try:
         warm_up(options.device)

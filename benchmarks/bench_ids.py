@@ -19,8 +19,6 @@ the views in order: what was out of sight comes back under a new id, and so does
 
 from __future__ import annotations
 
-import argparse
-import os
 import tempfile
 import time
 from collections.abc import Callable
@@ -30,9 +28,10 @@ from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
+from machine import REPOSITORY, parser_of
 from matching import Contingency, renamed
 from reliability_diagrams import ReliabilityDiagram
-from results import markdown, points
+from results import markdown, points, segmented, write_page
 from scipy import sparse
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
@@ -80,10 +79,8 @@ class Case(NamedTuple):
 
 def main() -> int:
     """Measure and write."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    repository = Path(__file__).resolve().parents[1]
-    parser.add_argument("--data", default=os.environ.get("GSSEG_DATA") or repository.parent / "shared/data", type=Path)
-    parser.add_argument("--out", default=repository / "results_out/ids.md", type=Path)
+    parser = parser_of(__doc__)
+    parser.add_argument("--out", default=REPOSITORY / "results_out/ids.md", type=Path)
     parser.add_argument("--scene", choices=("replica", "demo", "parts", "tracks"))
     options = parser.parse_args()
     warm_up()
@@ -101,9 +98,7 @@ def main() -> int:
             sections.append("## Replica apartment\n\n" + replica(folder))
         else:
             print(f"{folder}: not there; set GSSEG_DATA or --data to the folder that holds replica_apartment/")
-    options.out.parent.mkdir(parents=True, exist_ok=True)
-    options.out.write_text("\n\n".join(sections) + "\n", encoding="utf-8")
-    print(options.out)
+    write_page(options.out, "\n\n".join(sections) + "\n")
     return 0
 
 
@@ -135,8 +130,7 @@ def parts(data: Path) -> str:
         views = [replace(view, class_names=None) for view in Dataset(folder, "labels_parts").views("train")]
         tests = truth.views("test")
         learner, seconds = learnt(scene, views, True)
-        result = Segmentation.from_codes(scene, learner.codes_, {}, evidence=learner.evidence())
-        result = result.calibrated(calibrate(learner).temperature)
+        result = segmented(learner, {}).calibrated(calibrate(learner).temperature)
         found = label_maps(scene, result, tests)
         ious, objects = object_ious(labels_of(tests), found)
         lines.append([
@@ -160,8 +154,7 @@ def tracks(data: Path) -> str:
             row = [folder.name, kind, f"{lost:.0%}", str(ids)]
             for find in (False, True):
                 learner, _ = learnt(scene, views, find)
-                result = Segmentation.from_codes(scene, learner.codes_, {}, evidence=learner.evidence())
-                ious, objects = object_ious(labels_of(tests), label_maps(scene, result, tests))
+                ious, objects = object_ious(labels_of(tests), label_maps(scene, segmented(learner, {}), tests))
                 row += [points(float(ious.mean())), str(objects)]
             lines.append([*row, str(len(ious))])
             print(*lines[-1], sep=", ", flush=True)
@@ -229,8 +222,7 @@ def measure(scene: GaussianScene, data: Dataset, rows: list[Case]) -> str:
         views = [view for view in data.views("train") if view.name in case.labels]
         views = [View.from_arrays(view.camera, case.labels[view.name]) for view in views]
         learner, seconds = learnt(scene, views, case.find)
-        result = Segmentation.from_codes(scene, learner.codes_, {}, evidence=learner.evidence())
-        found = label_maps(scene, result, data.views("test"))
+        found = label_maps(scene, segmented(learner, {}), data.views("test"))
         score = overlaps(case.truth, found)
         shown = len(np.unique(np.concatenate([labels.ravel() for labels in found.values()])))
         true = len(np.unique(np.concatenate([labels.ravel() for labels in case.truth.values()])))

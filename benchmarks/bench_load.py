@@ -6,15 +6,13 @@ Usage: python benchmarks/bench_load.py
 from __future__ import annotations
 
 import argparse
-import os
-import platform
 import statistics
 import tempfile
-import time
 from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
+from machine import processor, timed
 
 from gsseg_core.scene.gaussian_scene import GaussianScene
 
@@ -27,7 +25,7 @@ def main() -> None:
     sh = rng.normal(size=(COUNT, 16, 3)).astype(np.float32)
     means, scales = rng.normal(size=(COUNT, 3)), rng.uniform(0.01, 0.1, (COUNT, 3))
     scene = GaussianScene.from_arrays(means, rng.normal(size=(COUNT, 4)), scales, rng.uniform(0.1, 0.9, COUNT), sh)
-    print(f"{platform.machine()}, {os.cpu_count()} cores; seconds, median of {RUNS}")
+    print(f"{processor()}; seconds, median of {RUNS}")
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "scene.ply"
         report("save", lambda: scene.save(path))
@@ -36,12 +34,7 @@ def main() -> None:
 
 
 def report(name: str, job: Callable[[], object]) -> None:
-    seconds = []
-    for _ in range(RUNS):
-        start = time.perf_counter()
-        job()
-        seconds.append(time.perf_counter() - start)
-    print(f"{name:<16}{statistics.median(seconds):.2f}")
+    print(f"{name:<16}{statistics.median(timed(job, RUNS)):.2f}")
 
 
 if __name__ == "__main__":

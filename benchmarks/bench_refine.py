@@ -8,19 +8,15 @@ here: the nearest of 40 random Gaussians, 3 % of them at random, and about one c
 
 from __future__ import annotations
 
-import argparse
 import importlib
 import os
-import platform
 import statistics
-import sys
-import time
 from collections.abc import Callable
-from pathlib import Path
 from typing import Any
 
 import numba as nb
 import numpy as np
+from machine import parser_of, processor, timed
 from scipy.spatial import cKDTree
 
 from gsseg_core.csr_rows import CSRRows
@@ -31,15 +27,13 @@ from gsseg_core.spatial.neighbourhood import Neighbours
 
 REPEATS = 7
 CLASSES = 40
-DATA = Path(os.environ.get("GSSEG_DATA", Path(__file__).resolve().parents[1] / "../shared/data"))
 
 
 def main() -> None:
     """Measure and print one table."""
-    argparse.ArgumentParser(description=__doc__).parse_args()
-    path = DATA / "replica_apartment" / "scene.ply"
+    path = parser_of(__doc__).parse_args().data / "replica_apartment" / "scene.ply"
     if not path.is_file():
-        print(f"skipped: no {path}; set GSSEG_DATA to the folder that holds replica_apartment/")
+        print(f"skipped: no {path}; set GSSEG_DATA or --data to the folder that holds replica_apartment/")
         return
     means = GaussianScene.load(path).means
     labels, probabilities, observed = make_codes(means)
@@ -57,7 +51,7 @@ def main() -> None:
     searches = {f"search: {name}": search for name, search in neighbour_searches(means, k).items()}
     print(f"{'':28} {'median ms':>10} {'best ms':>10}")
     for name, step in (steps | searches).items():
-        seconds = timed(step)
+        seconds = timed(step, REPEATS)
         print(f"{name:28} {1e3 * statistics.median(seconds):10.0f} {1e3 * min(seconds):10.0f}")
     print(f"\nsearch: mean distance of every Gaussian to its {k} nearest others, tree included; load {load()} after")
 
@@ -104,28 +98,9 @@ def optional(name: str) -> Any:
         return None
 
 
-def timed(step: Callable[[], object]) -> list[float]:
-    """Seconds of each of several runs, after one to warm up."""
-    step()
-    seconds = []
-    for _ in range(REPEATS):
-        start = time.perf_counter()
-        step()
-        seconds.append(time.perf_counter() - start)
-    return seconds
-
-
-def processor() -> str:
-    """Name of the processor."""
-    cpuinfo = Path("/proc/cpuinfo")
-    lines = cpuinfo.read_text().splitlines() if cpuinfo.is_file() else []
-    names = [line.split(":", 1)[1].strip() for line in lines if line.startswith("model name")]
-    return f"{names[0] if names else platform.processor() or platform.machine()} ({os.cpu_count()} cores)"
-
-
 def load() -> str:
     """Mean number of runnable processes over the last minute: above 0 before means that the machine was shared."""
-    return f"{os.getloadavg()[0]:.1f}" if sys.platform != "win32" else "unknown"
+    return f"{os.getloadavg()[0]:.1f}"
 
 
 if __name__ == "__main__":

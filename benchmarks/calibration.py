@@ -8,7 +8,6 @@ the demo scene is measured. Plots go to `pictures/` beside the document.
 
 from __future__ import annotations
 
-import argparse
 import sys
 import tempfile
 from collections.abc import Iterator, Sequence
@@ -18,16 +17,15 @@ from pathlib import Path
 import numpy as np
 from calibration_text import HEADER, ROADS, SCORES
 from jobs import hard_votes
-from machine import DATA, REPOSITORY
+from machine import REPOSITORY, parser_of
 from plots import Axis, draw_panels
 from reliability_diagrams import ReliabilityDiagram, risk_coverage
-from results import machine, markdown
+from results import machine, markdown, write_page
+from scenes import APARTMENT, DEMO, held_out, open_scenes
 from scipy.optimize import minimize_scalar
 
-from gsseg_core.data.dataset import Dataset
 from gsseg_core.data.label_evidence import VOTE_UNIT
 from gsseg_core.data.view import View, spread
-from gsseg_core.demo.table_scene import build_demo
 from gsseg_core.learn.calibrate import calibrate
 from gsseg_core.learn.em.em_learner import EMLearner, EMSettings
 from gsseg_core.learn.learner import Learner
@@ -52,8 +50,6 @@ from gsseg_core.warm_up import warm_up
 
 EM, VOTES, HARD, GRADIENT = "em", "votes", "FlashSplat's rule", "gradient"
 CLEAN, WRONG = "true masks", "wrong masks"
-HELD_OUT = 7
-"""One train view in so many is held out where ways are compared."""
 
 
 @dataclass(frozen=True)
@@ -79,13 +75,12 @@ class Taught:
 
 def main() -> int:
     """Measure and write."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--data", default=DATA, type=Path, help="folder that holds replica_apartment/")
+    parser = parser_of(__doc__)
     parser.add_argument("--out", default=REPOSITORY / "docs/calibration.md", type=Path, help="document to write")
     options = parser.parse_args()
     warm_up()
     with tempfile.TemporaryDirectory() as folder:
-        benches = list(open_benches(Path(folder), options.data / "replica_apartment"))
+        benches = list(open_benches(Path(folder), options.data))
         roads = [row for bench in benches for row in compare_roads(bench)]
         scores = measure_test(benches, options.out.parent / "pictures")
     header = HEADER.format(machine=machine())
@@ -95,24 +90,16 @@ def main() -> int:
         "ECE of Gaussians as learnt", "ECE of Gaussians",
     ]  # fmt: skip
     text = [header, SCORES.format(table=markdown(names, scores)), ROADS.format(table=markdown(ways, roads))]
-    options.out.write_text("\n".join(text), encoding="utf-8")
-    print(options.out)
+    write_page(options.out, "\n".join(text))
     return 0
 
 
-def open_benches(folder: Path, real: Path) -> Iterator[Bench]:
+def open_benches(folder: Path, data: Path) -> Iterator[Bench]:
     """Build the demo scene in a folder; open the real one, if it is there."""
-    demo = build_demo(folder)
-    true, wrong = Dataset(folder, "labels_true"), Dataset(folder)
-    train = {CLEAN: true.views("train"), WRONG: wrong.views("train")}
-    yield Bench("demo", demo.scene, true.class_names, train, true.views("test"), (EM, VOTES, HARD, GRADIENT))
-    if not real.is_dir():
-        print(f"{real}: not there; measuring the demo scene only")
-        return
-    true, wrong = Dataset(real), Dataset(real, "labels_noisy")
-    train = {CLEAN: true.views("train"), WRONG: wrong.views("train")}
-    scene = GaussianScene.load(real / "scene.ply")
-    yield Bench("apartment", scene, true.class_names, train, true.views("test"), (EM, VOTES, HARD))
+    for name, scene, true, wrong in open_scenes(folder, data, [APARTMENT]):
+        train = {CLEAN: true.views("train"), WRONG: wrong.views("train")}
+        learners = (EM, VOTES, HARD, *([GRADIENT] if name == DEMO else []))
+        yield Bench(name.removeprefix("replica_"), scene, true.class_names, train, true.views("test"), learners)
 
 
 def taught(bench: Bench, name: str, views: Sequence[View]) -> Taught:
@@ -149,11 +136,10 @@ def sample_pixels(image: np.ndarray, labels: np.ndarray) -> Sample:  # (H, W, K)
 
 def compare_roads(bench: Bench) -> Iterator[list[str]]:
     """Compare ways to choose the temperature, on train views that were held out, against their true masks."""
-    held = [view for i, view in enumerate(bench.train[CLEAN]) if i % HELD_OUT == HELD_OUT // 2]
-    names = {view.name for view in held}
+    _, held = held_out(bench.train[CLEAN])
     for masks, views in bench.train.items():
         for name in (EM, VOTES, HARD):
-            learnt = taught(bench, name, [view for view in views if view.name not in names])
+            learnt = taught(bench, name, held_out(views)[0])
             result = Segmentation.from_codes(bench.scene, learnt.codes, bench.class_names)
             images = [result.blend(make_operator(bench.scene, view.camera)) for view in held]
             truth = [view.read_labels() for view in held]

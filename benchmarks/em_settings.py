@@ -10,7 +10,6 @@ table goes to `docs/em_settings.md`. An hour on two cores. Real scenes lie in $G
 
 from __future__ import annotations
 
-import argparse
 import json
 import sys
 import tempfile
@@ -19,15 +18,14 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
-from machine import DATA, REPOSITORY
+from machine import REPOSITORY, parser_of
 from regret import SCENES, Bench, open_bench
-from results import machine, markdown, score
+from results import machine, markdown, score, segmented, write_page
 
 from gsseg_core.data.view import View
 from gsseg_core.files.json_files import write_json
 from gsseg_core.learn.em import boundary_alignment, rejected_regions
 from gsseg_core.learn.em.em_learner import EMLearner, EMSettings
-from gsseg_core.segmentation import Segmentation
 
 Group = dict[str, Sequence[float]]
 """Other values, by setting."""
@@ -53,10 +51,9 @@ KINDS = {
 
 def main() -> int:
     """Measure what is asked for and not known yet, print it, and write the table if it is whole."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = parser_of(__doc__)
     parser.add_argument("--scenes", nargs="+", default=SCENES, choices=SCENES)
     parser.add_argument("--kinds", nargs="+", default=list(KINDS), choices=KINDS)
-    parser.add_argument("--data", default=DATA, type=Path, help="folder of the real scenes")
     parser.add_argument("--kept", default=REPOSITORY / "results_out/em_settings.json", type=Path)
     options = parser.parse_args()
     measured = json.loads(options.kept.read_text()) if options.kept.exists() else {}
@@ -71,8 +68,7 @@ def main() -> int:
                     write_json(options.kept, measured)
                 print(f"{name}, {kind}: " + json.dumps(row), flush=True)
     if all(set(measured.get(name, {})) == set(KINDS) for name in SCENES):
-        text = TEXT.format(machine=machine(), table=table(measured))
-        (REPOSITORY / "docs/em_settings.md").write_text(text, encoding="utf-8")
+        write_page(REPOSITORY / "docs/em_settings.md", TEXT.format(machine=machine(), table=table(measured)))
     return 0
 
 
@@ -99,8 +95,7 @@ def learnt(
                 learner = EMLearner(bench.scene, bench.data.num_classes, settings)
                 learner.observe_all(views)
             learner.settings = settings
-            codes, evidence, names = learner.fit().codes_, learner.evidence(), bench.data.class_names
-            result = Segmentation.from_codes(bench.scene, codes, names, evidence=evidence)
+            result = segmented(learner.fit(), bench.data.class_names)
         yield what, round(100 * score(result, bench.scene, bench.truth).mean_iou, 3)
 
 

@@ -10,14 +10,13 @@ whose walls are far from the cameras, the test views are. Printed are means of m
 
 from __future__ import annotations
 
-import argparse
 import tempfile
 from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
 from em_settings import setting
-from machine import DATA, describe
+from machine import describe, parser_of
 from regret import SCENES, Bench, open_bench
 from results import markdown, points, score
 from workloads import RoomSize, write_room
@@ -42,12 +41,11 @@ CLAIMED = (0.1, rejected_regions.CLAIMED, 0.4, 1.0)
 
 def main() -> None:
     """Measure and print."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--data", type=Path, default=DATA, help="folder of the real scenes")
+    options = parser_of(__doc__).parse_args()
     print(describe())
     with tempfile.TemporaryDirectory() as folder:
         lines = []
-        for bench in benches(Path(folder), parser.parse_args().data):
+        for bench in benches(Path(folder), options.data):
             for count in VIEWS:
                 means = np.mean([measure(bench, kind, count) for kind in KINDS], axis=0)
                 lines.append([bench.name, str(count), *(points(float(mean)) for mean in means)])

@@ -11,7 +11,6 @@ seventh train view, kept out of learning, in place of the test views, as when th
 
 from __future__ import annotations
 
-import argparse
 import sys
 import tempfile
 import time
@@ -21,18 +20,17 @@ from functools import cached_property
 from pathlib import Path
 
 import numpy as np
-from bench_ids import instances
+from bench_ids import instances, labels_of
 from few_views_text import CURVES, HEADER, ONE_VIEW
 from jobs import hard_votes
-from machine import DATA, REPOSITORY
+from machine import REPOSITORY, parser_of
 from plots import Axis, draw_panels
-from results import machine, markdown, points
+from results import machine, markdown, points, write_page
+from scenes import APARTMENT, DEMO, held_out, open_scenes
 from scipy import ndimage
 
 from gsseg_core.data.dataset import Dataset
 from gsseg_core.data.view import View
-from gsseg_core.demo.table_scene import build_demo
-from gsseg_core.files.atomic import write_atomically
 from gsseg_core.learn.em.em_learner import EMLearner
 from gsseg_core.metrics import Evaluation
 from gsseg_core.objects.pick import Pick, pick_clicks, pick_mask, pick_masks
@@ -61,7 +59,6 @@ WAYS = {
     "two masks": "two masks, the second of the view that is proposed",
     "two masks, random": "two masks, the second of a random view that shows the object",
 }
-SCENES = ("shelf", "kitchen_table", "workbench")
 
 
 @dataclass(frozen=True)
@@ -83,8 +80,7 @@ class Bench:
 
 def main() -> int:
     """Measure and write."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--data", default=DATA, type=Path, help="folder that holds the scenes")
+    parser = parser_of(__doc__)
     parser.add_argument("--out", type=Path, help="document to write")
     parser.add_argument("--quick", action="store_true", help="one draw of views, fewer counts")
     parser.add_argument("--held-out", action="store_true", help="score on held-out train views")
@@ -108,37 +104,31 @@ def main() -> int:
         CURVES.format(draws=draws, scored=scored, tables=tables),
         ONE_VIEW.format(scored=scored, tables=one_view, least=LEAST),
     ]
-    with write_atomically(out) as temporary:
-        temporary.write_text("\n".join(content), encoding="utf-8")
-    print(f"{out}: {minutes} minutes")
+    write_page(out, "\n".join(content))
     return 0
 
 
-def open_benches(folder: Path, real: Path, held_out: bool) -> list[Bench]:
+def open_benches(folder: Path, real: Path, aside: bool) -> list[Bench]:
     """Make the demo scene and open the others, those that are there."""
-    demo = build_demo(folder)
-    data = Dataset(folder, "labels_true")
-    objects = {view.name: view.read_labels() for view in data.views()}
-    benches = [split("Demo scene", demo.scene, data, objects, held_out)]
-    for name in ("replica_apartment", *SCENES):
-        if not (real / name).is_dir():
-            print(f"{real / name}: not there, and so not measured")
-            continue
-        scene, data = GaussianScene.load(real / name / "scene.ply"), Dataset(real / name)
-        objects = {view.name: view.read_labels() for view in data.views()}
-        if name == "replica_apartment":
-            objects = instances(scene, data.views())
-        benches.append(split(name.replace("_", " ").capitalize(), scene, data, objects, held_out))
+    benches = []
+    for name, scene, data, _ in open_scenes(folder, real):
+        views = data.views()
+        objects = instances(scene, views) if name == APARTMENT else labels_of(views)
+        benches.append(split(titled(name), scene, data, objects, aside))
     return benches
 
 
-def split(name: str, scene: GaussianScene, data: Dataset, objects: Mapping[str, np.ndarray], held_out: bool) -> Bench:
-    """Choose which views are scored: the test views, or some of the train views in their place."""
+def split(name: str, scene: GaussianScene, data: Dataset, objects: Mapping[str, np.ndarray], aside: bool) -> Bench:
+    """Choose which views are scored: the test views, or some of the train views that are held out in their place."""
     train, test = data.views("train"), data.views("test")
-    if held_out:
-        test = train[3::7]
-        train = [view for view in train if view not in test]
+    if aside:
+        train, test = held_out(train)
     return Bench(name, scene, data.num_classes, train, test, objects)
+
+
+def titled(name: str) -> str:
+    """Name a scene as a heading does."""
+    return "Demo scene" if name == DEMO else name.replace("_", " ").capitalize()
 
 
 Curve = dict[str, dict[int, list[float]]]  # mIoU of each draw, by variant and number of views

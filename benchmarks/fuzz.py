@@ -27,7 +27,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from forked import MOST_MEMORY, Ended, in_child, run_command  # first: it says how numba runs
-from report import table
+from report import markdown
 
 from gsseg_core.text import printable
 
@@ -284,7 +284,7 @@ def main() -> int:
 def print_summary(tallies: list[Tally]) -> None:
     """Print the table, and each cause of findings with its first input."""
     header = ["inputs of", "inputs", "done", "refused", "findings", "longest [s]", "peak memory [MiB]"]
-    print("\n" + table(header, [tally.row() for tally in tallies]) + "\n")
+    print("\n" + markdown(header, [tally.row() for tally in tallies]) + "\n")
     for tally in tallies:
         for cause, numbers in sorted(tally.causes.items(), key=lambda found: -len(found[1])):
             print(f"{tally.what}: {len(numbers)} x {cause}; first: {', '.join(map(str, numbers[:3]))}")

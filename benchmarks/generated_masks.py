@@ -16,15 +16,14 @@ tree of parts and wholes, at whatever level.
 
 from __future__ import annotations
 
-import argparse
-import os
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 from bench_ids import Masks, evaluated, label_maps, labels_of, object_ious, overlaps
-from results import markdown, points
+from machine import REPOSITORY, parser_of
+from results import markdown, points, segmented, write_page
 
 from gsseg_core.data.dataset import Dataset
 from gsseg_core.data.label_images import UNKNOWN
@@ -40,11 +39,9 @@ COLUMNS = ["scene", "views", "masks a view", "ids", "objects", "found", "one-to-
 
 def main() -> int:
     """Measure and write."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    repository = Path(__file__).resolve().parents[1]
+    parser = parser_of(__doc__)
     parser.add_argument("masks", type=Path, metavar="MASKS")
-    parser.add_argument("--data", default=os.environ.get("GSSEG_DATA") or repository.parent / "shared/data", type=Path)
-    parser.add_argument("--out", default=repository / "results_out/generated_masks.md", type=Path)
+    parser.add_argument("--out", default=REPOSITORY / "results_out/generated_masks.md", type=Path)
     options = parser.parse_args()
     warm_up()
     lines = []
@@ -52,9 +49,7 @@ def main() -> int:
         for line in rows(options.data / folder.name, folder.resolve()):
             print(*line, sep=", ", flush=True)
             lines.append(line)
-    options.out.parent.mkdir(parents=True, exist_ok=True)
-    options.out.write_text(markdown(COLUMNS, lines) + "\n", encoding="utf-8")
-    print(options.out)
+    write_page(options.out, markdown(COLUMNS, lines) + "\n")
     return 0
 
 
@@ -91,9 +86,7 @@ def learnt(scene: GaussianScene, views: list[View], table: ObjectTable | None = 
     learner = EMLearner(scene, max(view.largest_label for view in views) + 1)
     learner.observe_all(views)
     learner.fit()
-    names = {} if table is None else table.class_names
-    result = Segmentation.from_codes(scene, learner.codes_, names, evidence=learner.evidence())
-    return result if table is None else table.with_tree(result)
+    return segmented(learner, {}) if table is None else table.with_tree(segmented(learner, table.class_names))
 
 
 def scores(scene: GaussianScene, result: Segmentation, tests: list[View]) -> list[str]:

@@ -10,29 +10,24 @@ share of their labelled pixels that views leave unknown to each other is what th
 
 from __future__ import annotations
 
-import argparse
 import sys
 import tempfile
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 import numpy as np
-from few_views import Bench, split
-from machine import DATA, REPOSITORY
-from regret import NO_BACKGROUND
+from few_views import Bench, split, titled
+from machine import REPOSITORY, parser_of
 from reliability_diagrams import ReliabilityDiagram
-from results import SCENES, markdown
+from results import markdown, write_page
+from scenes import NO_BACKGROUND, open_scenes
 from wrong_masks import WrongMasks, corrupt
 
-from gsseg_core.data.dataset import Dataset
 from gsseg_core.data.view import View
-from gsseg_core.demo.table_scene import build_demo
-from gsseg_core.files.atomic import write_atomically
 from gsseg_core.learn.calibrate import calibrate
 from gsseg_core.learn.em.em_learner import EMLearner
 from gsseg_core.metrics import Evaluation
 from gsseg_core.refine.label_propagation import UNKNOWN_SHARE, GraphSettings, propagate
-from gsseg_core.scene.gaussian_scene import GaussianScene
 from gsseg_core.segmentation import Segmentation
 from gsseg_core.spatial.neighbour_graph import graph_of
 from gsseg_core.warm_up import warm_up
@@ -46,25 +41,15 @@ COLUMNS = [
 
 def main() -> int:
     """Measure and write."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--data", default=DATA, type=Path, help="folder that holds the scenes")
+    parser = parser_of(__doc__)
     parser.add_argument("--out", default=REPOSITORY / "results_out/graph_term.md", type=Path, help="table to write")
     options = parser.parse_args()
     warm_up()
     rows = []
     with tempfile.TemporaryDirectory() as folder:
-        rows += compare(split("Demo scene", build_demo(folder).scene, Dataset(folder, "labels_true"), {}, True), 0)
-    for name in SCENES:
-        real = options.data / name
-        if real.is_dir():
-            scene = GaussianScene.load(real / "scene.ply")
-            missed = None if name in NO_BACKGROUND else 0
-            rows += compare(split(name.replace("_", " ").capitalize(), scene, Dataset(real), {}, True), missed)
-        else:
-            print(f"{real}: not there; set GSSEG_DATA or --data to the folder that holds it")
-    with write_atomically(options.out) as temporary:
-        temporary.write_text(markdown(COLUMNS, rows) + "\n", encoding="utf-8")
-    print(options.out)
+        for name, scene, true, _ in open_scenes(Path(folder), options.data):
+            rows += compare(split(titled(name), scene, true, {}, True), None if name in NO_BACKGROUND else 0)
+    write_page(options.out, markdown(COLUMNS, rows) + "\n")
     return 0
 
 

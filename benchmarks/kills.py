@@ -26,7 +26,7 @@ from pathlib import Path
 from typing import Protocol
 
 from forked import in_child, run_command  # first: it says how numba runs
-from report import table
+from report import markdown
 from whole_outputs import Fault, faults_of, leftovers, listing, read_folder
 
 KINDS = ("segment", "state", "save", "export", "learn")
@@ -278,7 +278,7 @@ def main() -> int:
         for what in wanted:
             tallies.append(kill_often(what, Path(name) / what, options.first, options.count, options.seed))
     print()
-    print(table(["job", "kills", "late", "takes [s]", *COLUMNS], [tally.row() for tally in tallies]))
+    print(markdown(["job", "kills", "late", "takes [s]", *COLUMNS], [tally.row() for tally in tallies]))
     print(f'"{AFTER}...": after the next command, or node, has read what was left. "late": ended before, killed anew.')
     examples = [text for tally in tallies for text in tally.examples.values()]
     print("\n".join(["", "First of each kind:", *examples] if examples else ["", "Nothing was wrong."]))

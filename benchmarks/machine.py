@@ -2,15 +2,13 @@
 
 from __future__ import annotations
 
+import argparse
 import importlib.metadata
 import itertools
 import os
 import platform
-import resource
-import statistics
 import time
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -24,24 +22,16 @@ DATA = Path(os.environ.get("GSSEG_DATA") or REPOSITORY.parent / "shared" / "data
 LIBRARIES = ("numpy", "numba", "llvmlite", "scipy", "torch", "pillow")
 
 
-@dataclass(frozen=True)
-class Timing:
-    """Median, least and most of several runs."""
-
-    median: float
-    least: float
-    most: float
-
-    @classmethod
-    def of(cls, values: Sequence[float]) -> Timing:
-        """Summarise the runs."""
-        return cls(statistics.median(values), min(values), max(values))
+def parser_of(description: str | None) -> argparse.ArgumentParser:
+    """Make the parser of a program that its docstring describes, with the option that says where real scenes lie."""
+    parser = argparse.ArgumentParser(description=description, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--data", type=Path, default=DATA, help="folder of the real scenes")
+    return parser
 
 
-def timed(job: Callable[[], object], runs: int, *, warm: bool = True) -> list[float]:
+def timed(job: Callable[[], object], runs: int) -> list[float]:
     """Seconds of each run of a job, after one that does not count."""
-    if warm:
-        job()
+    job()
     return [once(job) for _ in range(runs)]
 
 
@@ -64,11 +54,13 @@ def once(job: Callable[[], object]) -> float:
 
 def peak_memory() -> float:
     """Most memory that this process has had in use, in GiB."""
-    # Not getrusage where it can be helped: a child's count starts with what its parent held when it was forked.
-    status = Path("/proc/self/status")
-    if status.is_file():
-        return int(status.read_text().split("VmHWM:")[1].split()[0]) / 2**20
-    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 2**20
+    # Not getrusage: a child's count starts with what its parent held when it was forked.
+    return memory_of("VmHWM") / 2**30
+
+
+def memory_of(field: str, process: int | str = "self") -> int:
+    """Bytes that Linux tells of a process: VmHWM, the most in use so far, VmRSS, that in use now, or VmSize."""
+    return int(Path(f"/proc/{process}/status").read_text().split(f"{field}:")[1].split()[0]) << 10
 
 
 def describe() -> dict[str, Any]:

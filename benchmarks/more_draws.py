@@ -11,13 +11,11 @@ minutes on two cores.
 
 from __future__ import annotations
 
-import argparse
 from collections.abc import Sequence
 from dataclasses import replace
-from pathlib import Path
 
-from machine import DATA
-from results import markdown, points, score
+from machine import parser_of
+from results import markdown, points, score, segmented
 from view_errors import corrupt_views
 from wrong_masks import WrongMasks
 
@@ -25,7 +23,6 @@ from gsseg_core.data.dataset import Dataset
 from gsseg_core.data.view import View
 from gsseg_core.learn.em.em_learner import EMLearner, EMSettings
 from gsseg_core.scene.gaussian_scene import GaussianScene
-from gsseg_core.segmentation import Segmentation
 
 DRAWS = (1, 3, 6)
 EDGES_OFF = WrongMasks(missed=0.0, swapped=0.0, missed_label=None)
@@ -33,9 +30,7 @@ EDGES_OFF = WrongMasks(missed=0.0, swapped=0.0, missed_label=None)
 
 def main() -> int:
     """Measure and print."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--data", default=DATA, type=Path, help="folder that holds replica_apartment/")
-    real = parser.parse_args().data / "replica_apartment"
+    real = parser_of(__doc__).parse_args().data / "replica_apartment"
     if not real.is_dir():
         print(f"{real}: not there; nothing measured")
         return 0
@@ -66,8 +61,7 @@ def learnt(scene: GaussianScene, data: Dataset, views: Sequence[View], edge_px: 
     """Learn from views, and return mIoU in the test views."""
     learner = EMLearner(scene, data.num_classes, EMSettings(edge_px=edge_px))
     learner.observe_all(views)
-    result = Segmentation.from_codes(scene, learner.fit().codes_, data.class_names, evidence=learner.evidence())
-    return score(result, scene, data.views("test")).mean_iou
+    return score(segmented(learner.fit(), data.class_names), scene, data.views("test")).mean_iou
 
 
 if __name__ == "__main__":

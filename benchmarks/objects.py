@@ -9,21 +9,19 @@ to `results_out/`: so settings were chosen. Pictures of the real scenes go to `r
 
 from __future__ import annotations
 
-import argparse
 import sys
 import tempfile
 from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
-from machine import DATA, REPOSITORY
+from machine import REPOSITORY, parser_of
 from object_ceiling import best_selection
 from object_scores import ObjectScores, objects_of
-from results import SCENES, machine, markdown, points
+from results import machine, markdown, points, write_page
+from scenes import DEMO, Opened, held_out, open_scenes
 
-from gsseg_core.data.dataset import Dataset
 from gsseg_core.data.view import View, spread
-from gsseg_core.demo.table_scene import build_demo
 from gsseg_core.export.pictures import contact_sheet, save_png
 from gsseg_core.export.view_pictures import background_image
 from gsseg_core.learn.em.em_learner import EMLearner
@@ -42,7 +40,6 @@ WITHOUT_VIEWS = {
 }
 CARVED, TRUE_SILHOUETTES = "KNN + carving", "KNN + carving, by true masks"
 BEFORE, CEILING = "KNN + chosen by the truth of the train views", "KNN + chosen by the truth"
-HELD_OUT = slice(3, None, 7)
 
 Labels = dict[str, np.ndarray]
 """By way of refinement: the label of each Gaussian, (N,) int32."""
@@ -50,8 +47,7 @@ Labels = dict[str, np.ndarray]
 
 def main() -> int:
     """Measure and write."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--data", default=DATA, type=Path, help="folder that holds the scenes")
+    parser = parser_of(__doc__)
     parser.add_argument("--out", type=Path, help="document to write")
     parser.add_argument("--held-out", action="store_true", help="score train views that were held out from learning")
     options = parser.parse_args()
@@ -59,19 +55,8 @@ def main() -> int:
     out = options.out or (aside / "clean_objects.md" if options.held_out else REPOSITORY / "docs/clean_objects.md")
     rows: list[list[str]] = []
     with tempfile.TemporaryDirectory() as folder:
-        demo = build_demo(folder)
-        masks = {"true": "labels_true", "wrong": "labels"}
-        rows += measure(
-            "demo", demo.scene, Path(folder), masks, "labels_true", options.held_out, out.parent / "pictures"
-        )
-    masks = {"true": "labels", "wrong": "labels_noisy"}
-    for name in SCENES:
-        root = options.data / name
-        if root.is_dir():
-            scene = GaussianScene.load(root / "scene.ply")
-            rows += measure(name, scene, root, masks, "labels", options.held_out, aside)
-        else:
-            print(f"{root}: not there, and so not measured")
+        for bench in open_scenes(Path(folder), options.data):
+            rows += measure(bench, options.held_out, out.parent / "pictures")
     header = [
         "scene",
         "masks",
@@ -82,27 +67,20 @@ def main() -> int:
         "whole: boundary IoU",
     ]
     views = "train views that were held out from learning" if options.held_out else "test views"
-    out.write_text(TEXT.format(machine=machine(), views=views, table=markdown(header, rows)), encoding="utf-8")
-    print(out)
+    write_page(out, TEXT.format(machine=machine(), views=views, table=markdown(header, rows)))
     return 0
 
 
-def measure(
-    name: str, scene: GaussianScene, root: Path, masks: dict[str, str], true: str, held_out: bool, pictures: Path
-) -> list[list[str]]:
-    """Learn from each set of masks, refine in each way, and score: rows of the table."""
-    truth, rows = Dataset(root, true), []
-    for kind, folder in masks.items():
-        data = Dataset(root, folder)
-        train, scored = data.views("train"), truth.views("test")
-        if held_out:
-            names = {view.name for view in train[HELD_OUT]}
-            train = [view for view in train if view.name not in names]
-            scored = [view for view in truth.views("train") if view.name in names]
+def measure(bench: Opened, aside: bool, pictures: Path) -> list[list[str]]:
+    """Learn from each set of masks, refine in each way, and score: rows of the table; `aside`: on held-out views."""
+    (name, scene, truth, wrong), rows = bench, []
+    for kind, data in (("true", truth), ("wrong", wrong)):
+        train, true_masks, scored = data.views("train"), truth.views("train"), truth.views("test")
+        if aside:
+            (train, _), (true_masks, scored) = held_out(train), held_out(true_masks)
         learner = EMLearner(scene, data.num_classes)
         learner.observe_all(train)
-        true_masks = {view.name: view for view in truth.views("train")}
-        looked_at = spread([true_masks[view.name] for view in train], RefineSettings.carve_views)
+        looked_at = spread(true_masks, RefineSettings.carve_views)
         labels = refined(learner.fit(), data.class_names, looked_at)
         labels[BEFORE] = best_selection(scene, labels["KNN"], looked_at, scene)
         labels[CEILING] = best_selection(scene, labels["KNN"], scored, scene)
@@ -112,7 +90,7 @@ def measure(
             figures = [points(float(np.nanmean(value))) for pair in values for value in pair]
             rows.append([name, kind, way, *figures])
             print(*rows[-1], sep=", ", flush=True)
-        shown = pictures if (name, kind) == ("demo", "wrong") else REPOSITORY / "results_out"
+        shown = pictures if (name, kind) == (DEMO, "wrong") else REPOSITORY / "results_out"
         draw(labels, scene, truth.class_names, scores, scored, shown / f"objects_{name}_{kind}.png")
     return rows
 

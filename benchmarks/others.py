@@ -7,16 +7,15 @@ Gaussians are in view.
 from __future__ import annotations
 
 import importlib
-import importlib.metadata
 import json
 import os
 import tempfile
-import time
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from machine import once, version
 
 TILE = 16
 
@@ -45,7 +44,7 @@ def gsplat(scene: str, runs: int) -> dict[str, Any]:
         return entries, reference._isect_offset_encode(ids, 1, columns, rows)
 
     entries, offsets = assign()
-    answer = {"version": version("gsplat"), "project": seconds(project, runs), "bin": seconds(assign, 1)}
+    answer = {"version": version("gsplat"), "project": [once(project) for _ in range(runs)], "bin": [once(assign)]}
 
     def blend() -> Any:
         colors, opacities = data["colors"][None], data["opacities"][None]
@@ -92,21 +91,6 @@ def attempt(job: Callable[[], object], runs: int) -> dict[str, Any]:
     """Seconds of a job, or why it cannot be done."""
     try:
         job()
-        return {"render": seconds(job, runs)} if runs else {}
+        return {"render": [once(job) for _ in range(runs)]} if runs else {}
     except Exception as error:
         return {"failed": f"{type(error).__name__}: {error}"}
-
-
-def seconds(job: Callable[[], object], runs: int) -> list[float]:
-    """Seconds of each run."""
-    times = []
-    for _ in range(runs):
-        start = time.perf_counter()
-        job()
-        times.append(time.perf_counter() - start)
-    return times
-
-
-def version(package: str) -> str:
-    """Version of an installed package."""
-    return importlib.metadata.version(package)

@@ -15,7 +15,6 @@ background left out.
 
 from __future__ import annotations
 
-import argparse
 import itertools
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
@@ -23,8 +22,9 @@ from pathlib import Path
 
 import numpy as np
 from bench_ids import Masks, instances, labels_of, neighbours, object_ious, rng
-from machine import DATA
-from results import markdown, points
+from machine import REPOSITORY, parser_of
+from results import markdown, points, write_page
+from scenes import APARTMENT, held_out
 from scipy.cluster.vq import kmeans2
 from scipy.ndimage import gaussian_filter
 from skimage.color import rgb2lab
@@ -42,8 +42,6 @@ from gsseg_core.segmentation import Segmentation
 
 SCENES = {"shelf": 0, "kitchen_table": 0, "workbench": 2}
 """The last class that is not an object: what is behind them, and what they stand on."""
-
-APARTMENT = "replica_apartment"
 
 LEVELS = (0.1, 0.15, 0.2, 0.3, 0.4, 0.5)
 LEAST_PX = 120
@@ -169,8 +167,7 @@ def trials(
     train = dataset.views("train")
     true = instances(scene, dataset.views()) if folder.name == APARTMENT else labels_of(train)
     given = {view.name: view for view in Dataset(folder, "labels_parts").views("train")}
-    kept = [view for k, view in enumerate(train) if k % 7 != 3]
-    tests = [view for k, view in enumerate(train) if k % 7 == 3]
+    kept, tests = held_out(train)
     more = f" {seed}" if seed else ""
     for way in ways:
         views = []
@@ -185,13 +182,11 @@ def trials(
 
 def main() -> int:
     """Measure, print and write."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    repository = Path(__file__).resolve().parents[1]
-    parser.add_argument("--data", default=DATA, type=Path)
+    parser = parser_of(__doc__)
     parser.add_argument("--draws", choices=(9, 27), default=9, type=int)
     parser.add_argument("--seed", default=0, type=int, help="of the draws; masks as given are left out but for 0")
     parser.add_argument("--scene", choices=(*SCENES, APARTMENT))
-    parser.add_argument("--out", default=repository / "results_out/part_draws.md", type=Path)
+    parser.add_argument("--out", default=REPOSITORY / "results_out/part_draws.md", type=Path)
     options = parser.parse_args()
     ways, lines, behind = draws(options.draws), [], []
     for folder in (options.data / name for name in ([options.scene] if options.scene else SCENES)):
@@ -212,9 +207,8 @@ def main() -> int:
     head = ["scene", "parts; merged; missing", "found", "level told", "IoU there", *(f"at {level}" for level in LEVELS)]
     mean, most = 100 * np.mean(behind), 100 * max(behind)
     said = f"Behind the best level of each: {mean:.1f} points on the mean, {most:.1f} at most."
-    options.out.parent.mkdir(parents=True, exist_ok=True)
-    options.out.write_text(markdown(head, lines) + f"\n\n{said}\n", encoding="utf-8")
-    print(said, options.out, sep="\n")
+    print(said)
+    write_page(options.out, markdown(head, lines) + f"\n\n{said}\n")
     return 0
 
 

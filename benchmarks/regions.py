@@ -9,21 +9,19 @@ matter of luck, and one draw tells little.
 
 from __future__ import annotations
 
-import argparse
 import tempfile
 import time
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 import numpy as np
-from machine import DATA, describe
-from results import score
+from machine import describe, parser_of
+from results import score, segmented
 from robustness import Bench, open_benches
 from view_errors import corrupt_views, errors_at
 
 from gsseg_core.data.view import View, spread
 from gsseg_core.learn.em.em_learner import EMLearner, EMSettings
-from gsseg_core.segmentation import Segmentation
 from gsseg_core.warm_up import warm_up
 
 SHARES = (0.0, 0.02, 0.05, 0.1, 0.2)
@@ -40,13 +38,11 @@ KINDS = {
 
 def main() -> None:
     """Measure and print."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--data", type=Path, default=DATA, help="folder of the real scenes")
-    options = parser.parse_args()
+    options = parser_of(__doc__).parse_args()
     print(describe())
     warm_up()
     with tempfile.TemporaryDirectory() as folder:
-        for bench in open_benches(Path(folder), options.data / "replica_apartment", False):
+        for bench in open_benches(Path(folder), options.data, False):
             print("\n" + f"{bench.name:>26}" + "".join(f"{share:>18g}" for share in SHARES))
             drawn = []
             for what, views in masks(bench):
@@ -79,9 +75,7 @@ def learn(bench: Bench, views: Sequence[View], share: float) -> tuple[float, flo
     start = time.perf_counter()
     learner.fit()
     seconds = time.perf_counter() - start
-    names, evidence = bench.data.class_names, learner.evidence()
-    result = Segmentation.from_codes(bench.scene, learner.codes_, names, evidence=evidence)
-    return score(result, bench.scene, bench.test).mean_iou, seconds
+    return score(segmented(learner, bench.data.class_names), bench.scene, bench.test).mean_iou, seconds
 
 
 if __name__ == "__main__":

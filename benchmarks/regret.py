@@ -11,7 +11,6 @@ for each on two cores. Real scenes lie in $GSSEG_DATA, default ../shared/data.
 
 from __future__ import annotations
 
-import argparse
 import json
 import sys
 import tempfile
@@ -21,21 +20,20 @@ from pathlib import Path
 
 import numpy as np
 from jobs import hard_votes
-from machine import DATA, REPOSITORY
-from results import machine, markdown, score
+from machine import REPOSITORY, parser_of
+from results import machine, markdown, score, write_page
+from scenes import DEMO, NO_BACKGROUND, REAL, held_out, open_scene
 from view_errors import corrupt_views, errors_at, typical_depth
 from wrong_masks import WrongMasks
 
 from gsseg_core.data.dataset import Dataset
 from gsseg_core.data.view import View
-from gsseg_core.demo.table_scene import build_demo
 from gsseg_core.files.json_files import write_json
 from gsseg_core.learn.em.em_learner import EMLearner, EMSettings
 from gsseg_core.scene.gaussian_scene import GaussianScene
 from gsseg_core.segmentation import Segmentation
 
-SCENES = ("demo", "replica_apartment", "shelf", "kitchen_table", "workbench")
-NO_BACKGROUND = ("replica_apartment", "workbench")
+SCENES = (DEMO, *REAL)
 STRENGTHS = {"clutter": 0.5, "bad frames": 0.4, "shifted masks": 0.4, "jittered poses": 0.4}
 KINDS = ("true", "as given", "own draw", *STRENGTHS)
 EM, UNMOVED, PLAIN, MATRICES = "em", "em, masks as they came", "plain em", "matrices alone"
@@ -43,7 +41,6 @@ VOTES = ("votes", "hard votes")
 ALIGNED = ", moved"
 NEVER = 1e-9  # so low a share rejects nothing, and regions are still split as they are for other shares
 BAR = 0.3  # points that regret should not exceed
-EVERY, FIRST = 7, 3  # which train views are held out
 
 
 @dataclass(frozen=True)
@@ -72,12 +69,11 @@ class Bench:
 
 def main() -> int:
     """Measure what is asked for, print it, and write the table if it is whole."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = parser_of(__doc__)
     parser.add_argument("--scenes", nargs="+", default=SCENES, choices=SCENES)
     parser.add_argument("--kinds", nargs="+", default=KINDS, choices=KINDS)
     parser.add_argument("--again", nargs="+", default=(), help="learners to measure anew")
     parser.add_argument("--test", action="store_true", help="learn from all train views, and score on the test views")
-    parser.add_argument("--data", default=DATA, type=Path, help="folder of the real scenes")
     parser.add_argument("--kept", default=REPOSITORY / "results_out/regret.json", type=Path)
     options = parser.parse_args()
     measured = json.loads(options.kept.read_text()) if options.kept.exists() else {}
@@ -100,15 +96,11 @@ def main() -> int:
 
 def open_bench(name: str, folder: Path, data: Path, test: bool) -> Bench:
     """Open a scene, the demo's built in a folder, with the views to learn from and to score on."""
-    scene = build_demo(folder).scene if name == "demo" else GaussianScene.load(data / name / "scene.ply")
-    true, wrong = ("labels_true", "labels") if name == "demo" else ("labels", "labels_noisy")
-    where = folder if name == "demo" else data / name
-    dataset = Dataset(where, true)
-    train, given = dataset.views("train"), Dataset(where, wrong).views("train")
-    if test:
-        return Bench(name, scene, dataset, train, given, dataset.views("test"))
-    kept = [i for i in range(len(train)) if i % EVERY != FIRST]
-    return Bench(name, scene, dataset, [train[i] for i in kept], [given[i] for i in kept], train[FIRST::EVERY])
+    _, scene, true, wrong = open_scene(name, folder, data)
+    train, given, scored = true.views("train"), wrong.views("train"), true.views("test")
+    if not test:
+        (train, scored), (given, _) = held_out(train), held_out(given)
+    return Bench(name, scene, true, train, given, scored)
 
 
 def learnt(bench: Bench, views: Sequence[View], known: set[str]) -> Iterator[tuple[str, np.ndarray]]:
@@ -152,8 +144,7 @@ def write_table(measured: dict[str, dict[str, dict[str, float]]], path: Path) ->
     table = markdown(["scene", "masks", EM, "regret", *others], rows)
     where = f"{worst[0]:.2f} ({worst[1]}, {worst[2]}); {above} of {len(rows)} are above {BAR}"
     strengths = ", ".join(f"{strength} ({kind})" for kind, strength in STRENGTHS.items())
-    text = HEADER.format(machine=machine(), table=table, worst=where, strengths=strengths)
-    path.write_text(text, encoding="utf-8")
+    write_page(path, HEADER.format(machine=machine(), table=table, worst=where, strengths=strengths))
 
 
 HEADER = """# Regret

@@ -88,8 +88,8 @@ class Report:
         """
         folder.mkdir(parents=True, exist_ok=True)
         path = folder / "BENCHMARK.json"
-        markdown = self.markdown(text, Report.load(path), bars)
-        (folder / "BENCHMARK.md").write_text(markdown, encoding="utf-8")
+        page = self.markdown(text, Report.load(path), bars)
+        (folder / "BENCHMARK.md").write_text(page, encoding="utf-8")
         content = {"format": FORMAT, **asdict(self)}
         path.write_text(json.dumps(content, indent=1) + "\n", encoding="utf-8")
 
@@ -106,16 +106,16 @@ class Report:
     def markdown(self, text: str, last: Report | None, bars: Sequence[Bar] = ()) -> str:
         """Write everything down, beside an earlier run of the same sizes."""
         compared = last if last is not None and last.sizes == self.sizes else None
-        parts = [text, "## Machine", table(["", ""], [[key, str(value)] for key, value in self.machine.items()])]
+        parts = [text, "## Machine", markdown(["", ""], [[key, str(value)] for key, value in self.machine.items()])]
         parts.append(self._compared_with(last, compared))
         if bars:
             judged = [[*self._judge(bar), _found(compared, bar)] for bar in bars]
-            parts += ["## What was asked for", table(["what", "bar", "measured", "", "last time"], judged)]
+            parts += ["## What was asked for", markdown(["what", "bar", "measured", "", "last time"], judged)]
         for section, sentences in self.said.items():
             parts += [f"## {section[:1].upper()}{section[1:]}", *sentences]
             rows = [self._line(row, compared) for row in self.rows if row.section == section]
             if rows:
-                parts.append(table(["", "median", "spread", "runs", "last time", "now / last"], rows))
+                parts.append(markdown(["", "median", "spread", "runs", "last time", "now / last"], rows))
         return "\n\n".join(part.strip("\n") for part in parts) + "\n"
 
     def _compared_with(self, last: Report | None, compared: Report | None) -> str:
@@ -156,7 +156,7 @@ def short(value: float) -> str:
     return f"{round(value, digits):,.{max(digits, 0)}f}"
 
 
-def table(header: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
+def markdown(header: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
     """Write a table in Markdown."""
     lines = [header, ["---"] * len(header), *rows]
     return "\n".join("| " + " | ".join(cell.replace("|", "/") for cell in line) + " |" for line in lines)

@@ -8,23 +8,25 @@ left out. Nothing of it is copied.
 
 from __future__ import annotations
 
-import argparse
 import os
 import platform
 import statistics
-import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 
 import numpy as np
+from children import finish, seconds_of
 from jobs import hard_votes
-from machine import DATA, REPOSITORY, processor
+from machine import REPOSITORY, parser_of, processor
+from report import markdown
+from scenes import REAL
 
 from gsseg_core.data.dataset import Dataset
 from gsseg_core.data.view import View
+from gsseg_core.files.atomic import write_atomically
 from gsseg_core.learn.em.em_learner import EMLearner, EMSettings
 from gsseg_core.learn.learner import Learner
 from gsseg_core.learn.registry import make_learner
@@ -34,19 +36,17 @@ from gsseg_core.scene.gaussian_scene import GaussianScene
 from gsseg_core.segmentation import Segmentation
 
 MASKS = {"labels": "true masks", "labels_noisy": "wrong masks"}
-SCENES = ("replica_apartment", "shelf", "kitchen_table", "workbench")
 RUNS = 3
 
 
 def main() -> int:
     """Measure and write."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--data", default=DATA, type=Path, help="folder that holds the scenes")
+    parser = parser_of(__doc__)
     parser.add_argument("--out", default=REPOSITORY / "docs/results.md", type=Path)
     options = parser.parse_args()
     learners: list[list[str]] = []
     commands: list[list[str]] = []
-    for name in SCENES:
+    for name in REAL:
         folder = options.data / name
         if folder.is_dir():
             learners += learn_all(folder)
@@ -62,8 +62,7 @@ def main() -> int:
         LEARNERS.format(table=markdown(header, learners)),
         COMMAND.format(table=markdown(COMMAND_COLUMNS, commands)),
     ]
-    options.out.write_text("\n".join(sections), encoding="utf-8")
-    print(options.out)
+    write_page(options.out, "\n".join(sections))
     return 0
 
 
@@ -101,6 +100,11 @@ def learn(name: str, scene: GaussianScene, data: Dataset) -> np.ndarray:
     return codes
 
 
+def segmented(learner: Learner, class_names: Mapping[int, str]) -> Segmentation:
+    """Refine what a learner has learnt, and label all Gaussians."""
+    return Segmentation.from_codes(learner.scene, learner.codes_, class_names, evidence=learner.evidence())
+
+
 def score(result: Segmentation, scene: GaussianScene, truth: Iterable[View]) -> Evaluation:
     """Score rendered label maps against the true labels of views."""
     evaluation = Evaluation()
@@ -114,20 +118,11 @@ def command(folder: Path) -> list[list[str]]:
     rows = []
     for masks in MASKS:
         with tempfile.TemporaryDirectory() as out:
-            segment = [
-                sys.executable, "-m", "gsseg_core.cli", "segment", str(folder / "scene.ply"), "--data", str(folder),
-                "--labels", masks, "--out", f"{out}/out", "--quiet",
-            ]  # fmt: skip
-            seconds = []
-            for _ in range(RUNS):
-                start = time.perf_counter()
-                subprocess.run(segment, check=True, stdout=subprocess.DEVNULL)
-                seconds.append(time.perf_counter() - start)
-            render = [
-                sys.executable, "-m", "gsseg_core.cli", "render", str(folder / "scene.ply"), "--data", str(folder),
-                "--segmentation", f"{out}/out/segmentation.npz", "--out", f"{out}/test", "--quiet",
-            ]  # fmt: skip
-            subprocess.run(render, check=True, stdout=subprocess.DEVNULL)
+            gsseg, on = [sys.executable, "-m", "gsseg_core.cli"], [str(folder / "scene.ply"), "--data", str(folder)]
+            segment = [*gsseg, "segment", *on, "--labels", masks, "--out", f"{out}/out", "--quiet"]
+            seconds = [seconds_of(segment) for _ in range(RUNS)]
+            segmentation = ["--segmentation", f"{out}/out/segmentation.npz"]
+            finish([*gsseg, "render", *on, *segmentation, "--out", f"{out}/test", "--quiet"])
             scores = evaluate_folders(f"{out}/test", folder / "labels")
         values = (scores.mean_iou, scores.mean_accuracy, scores.mean_boundary_iou)
         rows.append([folder.name, MASKS[masks], f"{statistics.median(seconds):.1f}", *map(points, values)])
@@ -140,10 +135,11 @@ def points(value: float) -> str:
     return f"{value:.3f}"
 
 
-def markdown(header: list[str], rows: list[list[str]]) -> str:
-    """Write a table in Markdown."""
-    lines = [header, ["---"] * len(header), *rows]
-    return "\n".join("| " + " | ".join(line) + " |" for line in lines)
+def write_page(path: Path, text: str) -> None:
+    """Write what was measured, whole or not at all, and say where it is."""
+    with write_atomically(path) as temporary:
+        temporary.write_text(text, encoding="utf-8")
+    print(path)
 
 
 def machine() -> str:

@@ -29,7 +29,7 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tests/helpers"))
 import numpy as np
 import pytest
 from builtin_interfaces.msg import Time
-from report import table
+from report import markdown
 from ros_helpers import Process, Ros
 from ros_robot import CLASSES, Robot
 from rosgraph_msgs.msg import Clock
@@ -377,8 +377,8 @@ def main() -> int:
             day.close()
     found = day.found
     print(f"\nseed {options.seed}, {options.minutes:g} minutes at {options.rate:g} masks per second\n")
-    print(table(["what", "measured", "bar", ""], found.rows) + "\n")
-    print(table(["event", "times"], [[name, str(count)] for name, count in sorted(found.done.items())]) + "\n")
+    print(markdown(["what", "measured", "bar", ""], found.rows) + "\n")
+    print(markdown(["event", "times"], [[name, str(count)] for name, count in sorted(found.done.items())]) + "\n")
     print("Answers that were no fault: " + (", ".join(f"{n} {name}" for name, n in found.refused.items()) or "none"))
     print("\n".join(found.wrong[:20]))
     return int(any(row[-1] != "met" for row in found.rows))

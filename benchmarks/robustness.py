@@ -10,7 +10,6 @@ to `results_out/` alone.
 
 from __future__ import annotations
 
-import argparse
 import json
 import sys
 import tempfile
@@ -21,18 +20,18 @@ from pathlib import Path
 
 import numpy as np
 from jobs import hard_votes
-from machine import DATA, REPOSITORY
+from machine import REPOSITORY, parser_of
 from moving_occluder import DepthOf, depth_of_demo, depth_of_scene, gated, occlude
 from PIL import Image
 from plots import Axis, draw_panels
-from results import machine, markdown, points, score
+from results import machine, markdown, points, score, segmented, write_page
 from robustness_text import BAR, CURVES, HEADER, OCCLUDER, RELIABILITY
+from scenes import APARTMENT, DEMO, open_scenes
 from view_errors import STRONGEST, PoseErrors, corrupt_views, errors_at, typical_depth
 from wrong_masks import WrongMasks
 
 from gsseg_core.data.dataset import Dataset
 from gsseg_core.data.view import View, spread
-from gsseg_core.demo.table_scene import build_demo
 from gsseg_core.export.view_pictures import draw_worst_views
 from gsseg_core.files.atomic import write_atomically
 from gsseg_core.learn.em.em_learner import EMLearner, EMSettings
@@ -96,8 +95,7 @@ class Bench:
 
 def main() -> int:
     """Measure and write."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--data", default=DATA, type=Path, help="folder that holds replica_apartment/")
+    parser = parser_of(__doc__)
     parser.add_argument("--out", type=Path, help="document to write")
     parser.add_argument("--quick", action="store_true", help="fewer views and strengths, to see that all works")
     options = parser.parse_args()
@@ -106,37 +104,29 @@ def main() -> int:
     start = time.perf_counter()
     warm_up()
     with tempfile.TemporaryDirectory() as folder:
-        benches = list(open_benches(Path(folder), options.data / "replica_apartment", options.quick))
+        benches = list(open_benches(Path(folder), options.data, options.quick))
         sections = [measure_bar(benches), measure_curves(benches, out.parent / "pictures", aside)]
         sections.append(measure_reliability(benches, out.parent / "pictures", aside))
         sections.append(measure_occluder(benches))
     minutes = (time.perf_counter() - start) / 60
     header = HEADER.format(machine=machine(), minutes=f"{minutes:.0f}", quick=" --quick" * options.quick)
-    out.write_text("\n".join([header, *sections]), encoding="utf-8")
-    print(f"{out}: {minutes:.1f} minutes")
+    write_page(out, "\n".join([header, *sections]))
     return 0
 
 
-def open_benches(folder: Path, real: Path, quick: bool) -> Iterator[Bench]:
+def open_benches(folder: Path, data: Path, quick: bool) -> Iterator[Bench]:
     """Build the demo scene in a folder; open the real one, if it is there."""
-    demo = build_demo(folder)
-    data = Dataset(folder, "labels_true")
     fewer = (0.5, 1.0)
-    train, test = data.views("train"), data.views("test")
-    if quick:
-        yield Bench("demo scene", demo.scene, data, train[::3], test, len(train), fewer, fewer[1:])
-    else:
-        yield Bench("demo scene", demo.scene, data, train, test, len(train))
-    if not real.is_dir():
-        print(f"{real}: not there; measuring the demo scene only")
-        return
-    data = Dataset(real)
-    scene, train, test = GaussianScene.load(real / "scene.ply"), data.views("train"), data.views("test")
-    given = Dataset(real, "labels_noisy").views("train")
-    if quick:
-        yield Bench("real scene", scene, data, train[::5], test, 21, fewer[1:], (), None, given[::5])
-    else:
-        yield Bench("real scene", scene, data, train, test, 53, STRENGTHS, fewer, None, given)
+    for name, scene, true, wrong in open_scenes(folder, data, [APARTMENT]):
+        train, given, test = true.views("train"), wrong.views("train"), true.views("test")
+        if name == DEMO and quick:
+            yield Bench("demo scene", scene, true, train[::3], test, len(train), fewer, fewer[1:])
+        elif name == DEMO:
+            yield Bench("demo scene", scene, true, train, test, len(train))
+        elif quick:
+            yield Bench("real scene", scene, true, train[::5], test, 21, fewer[1:], (), None, given[::5])
+        else:
+            yield Bench("real scene", scene, true, train, test, 53, STRENGTHS, fewer, None, given)
 
 
 def learn(bench: Bench, views: Sequence[View], names: Sequence[str] = LEARNERS) -> dict[str, float]:
@@ -335,7 +325,7 @@ def measure_occluder(benches: Sequence[Bench]) -> str:
             scores = {}
             for title, seen in sets.items():
                 learner = taught(name, bench, seen, person + 1)
-                result = Segmentation.from_codes(bench.scene, learner.codes_, names, evidence=learner.evidence())
+                result = segmented(learner, names)
                 # Over the classes of the scene, to which the person does not belong.
                 scores[title] = float(np.nanmean(score(result, bench.scene, bench.test).iou[:person]))
             print(f"{bench.name}, somebody in front: {name} {scores}", flush=True)

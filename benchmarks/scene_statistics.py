@@ -7,13 +7,11 @@ The real scenes are those of $GSSEG_DATA (default ../shared/data beside the repo
 
 from __future__ import annotations
 
-import argparse
 from collections.abc import Sequence
-from pathlib import Path
 
 import numpy as np
 from lift_rate import count_work
-from machine import DATA
+from machine import parser_of
 from room import build_room
 from scipy.spatial import cKDTree
 
@@ -30,13 +28,13 @@ CAMERAS = 20
 
 def main() -> None:
     """Print a table of each scene."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = parser_of(__doc__)
     parser.add_argument("--gaussians", type=int, default=1_000_000, help="of the room")
     options = parser.parse_args()
     for name in ("replica_apartment", "fern"):
-        folder: Path = DATA / name
+        folder = options.data / name
         if not folder.is_dir():
-            print(f"skipped: no {folder}; set GSSEG_DATA to the folder that holds {name}/\n")
+            print(f"skipped: no {folder}; set GSSEG_DATA or --data to the folder that holds {name}/\n")
             continue
         show(name, scene_statistics(GaussianScene.load(folder / "scene.ply"), Dataset(folder).cameras))
     room = build_room(options.gaussians)

@@ -13,25 +13,20 @@ what was looked for.
 
 from __future__ import annotations
 
-import argparse
 import tempfile
 from collections.abc import Iterator, Sequence
 from pathlib import Path
-from typing import NamedTuple
 
 import numpy as np
-from machine import DATA
-from results import SCENES, markdown, points, score
+from machine import parser_of
+from results import markdown, points, score, segmented
+from scenes import Opened, open_scenes
 from scipy.ndimage import distance_transform_edt
 from scipy.special import ndtr
 
-from gsseg_core.data.dataset import Dataset
 from gsseg_core.data.label_images import UNKNOWN
 from gsseg_core.data.view import View
-from gsseg_core.demo.table_scene import build_demo
 from gsseg_core.learn.registry import make_learner
-from gsseg_core.scene.gaussian_scene import GaussianScene
-from gsseg_core.segmentation import Segmentation
 
 LEARNERS = ("em", "votes")
 EDGES = (1.0, 3.0)
@@ -41,43 +36,21 @@ LEAST_SURE = 0.5
 LOOKED_FOR = 1 / 3
 
 
-class Bench(NamedTuple):
-    """A scene with its views."""
-
-    name: str
-    scene: GaussianScene
-    data: Dataset
-    wrong: Dataset  # the same with wrong masks
-
-
 def main() -> None:
     """Measure and print."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--data", default=DATA, type=Path, help="folder that holds the scenes")
+    parser = parser_of(__doc__)
     parser.add_argument("--seeds", default=2, type=int, help="draws of the masks, of which the mean is printed")
     options = parser.parse_args()
     with tempfile.TemporaryDirectory() as folder:
-        rows = [row for bench in benches(Path(folder), options.data) for row in measure(bench, options.seeds)]
+        rows = [row for bench in open_scenes(Path(folder), options.data) for row in measure(bench, options.seeds)]
     print(markdown(["scene", "masks", *LEARNERS], rows))
 
 
-def benches(folder: Path, data: Path) -> Iterator[Bench]:
-    """Build the demo scene in a folder; open the others that are there."""
-    scene = build_demo(folder).scene
-    yield Bench("demo", scene, Dataset(folder, "labels_true"), Dataset(folder))
-    for name in SCENES:
-        if (data / name).is_dir():
-            scene = GaussianScene.load(data / name / "scene.ply")
-            yield Bench(name, scene, Dataset(data / name), Dataset(data / name, "labels_noisy"))
-        else:
-            print(f"{data / name}: not there, and so not measured")
-
-
-def measure(bench: Bench, seeds: int) -> Iterator[list[str]]:
+def measure(bench: Opened, seeds: int) -> Iterator[list[str]]:
     """Learn from all kinds of masks; one row of the table for each."""
-    train, classes = bench.data.views("train"), [k for k in bench.data.class_names if k]
+    train, classes = bench.true.views("train"), [k for k in bench.true.class_names if k]
     wrong = {view.name: view for view in bench.wrong.views("train")}
-    pairs = [doubted(train, bench.data.num_classes, np.random.default_rng(seed)) for seed in range(seeds)]
+    pairs = [doubted(train, bench.true.num_classes, np.random.default_rng(seed)) for seed in range(seeds)]
     rngs = [np.random.default_rng(seed) for seed in range(seeds)]
     drawn = [[(view, looked_for(classes, rng)) for view in train] for rng in rngs]
     kinds = {
@@ -99,17 +72,16 @@ def measure(bench: Bench, seeds: int) -> Iterator[list[str]]:
         yield [bench.name, kind, *learn(bench, draws)]
 
 
-def learn(bench: Bench, draws: Sequence[Sequence[View]]) -> list[str]:
+def learn(bench: Opened, draws: Sequence[Sequence[View]]) -> list[str]:
     """Learn from each draw of the masks with each learner, and score in the test views: mean mIoU over the draws."""
     out = []
     for name in LEARNERS:
         scores = []
         for views in draws:
-            learner = make_learner(name, bench.scene, bench.data.num_classes)
+            learner = make_learner(name, bench.scene, bench.true.num_classes)
             learner.observe_all(views)
-            codes, evidence, names = learner.fit().codes_, learner.evidence(), bench.data.class_names
-            result = Segmentation.from_codes(bench.scene, codes, names, evidence=evidence)
-            scores.append(score(result, bench.scene, bench.data.views("test")).mean_iou)
+            result = segmented(learner.fit(), bench.true.class_names)
+            scores.append(score(result, bench.scene, bench.true.views("test")).mean_iou)
         print(f"{bench.name}, {name}: {scores}", flush=True)
         out.append(points(float(np.mean(scores))))
     return out

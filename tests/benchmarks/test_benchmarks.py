@@ -208,7 +208,7 @@ def test_every_learner_is_calibrated_and_every_way_to_do_so_compared(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     learners = [calibration.EM, calibration.VOTES, calibration.HARD, calibration.GRADIENT]
-    clean, test = clean_views(calibration.HELD_OUT), clean_views(2, "test", 0.3)
+    clean, test = clean_views(7), clean_views(2, "test", 0.3)
     train = {calibration.CLEAN: clean, calibration.WRONG: corrupt_views(clean, 0, WrongMasks())}
     balls = calibration.Bench("balls", SCENE, NAMES, train, test, learners)
     monkeypatch.setattr(calibration, "open_benches", lambda folder, real: iter([balls]))
