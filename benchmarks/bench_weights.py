@@ -9,16 +9,14 @@ a step over one view and bytes of the view in either way, and how many labels ar
 
 from __future__ import annotations
 
-import argparse
 import statistics
 import sys
-from pathlib import Path
 from typing import Any
 
 import numba as nb
 import numpy as np
 from llvmlite import ir
-from machine import DATA, asked_anew, describe, timed
+from machine import asked_anew, describe, parser_of, timed
 from numba.core import types
 from workloads import REAL, RoomSize, make_room, true_labels
 
@@ -45,8 +43,7 @@ STEPS = 65535.0
 
 def main() -> None:
     """Measure and print."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--data", type=Path, default=DATA, help="folder of the real scenes")
+    parser = parser_of(__doc__)
     parser.add_argument("--gaussians", type=int, default=1_000_000, help="of the room")
     parser.add_argument("--views", type=int, default=20, help="views to learn from")
     parser.add_argument("--runs", type=int, default=5)
@@ -110,26 +107,25 @@ class StoredWeights(TileObservation):
         """Share out as ever, with stored weights."""
         mask = self._mask
         logs, left_over = np.zeros(len(self._records)), np.zeros(len(mask.present))
-        sums, numbered = np.empty(self._slot_start[-1], np.float32), np.empty_like(likelihood)
-        numbered[self._number] = likelihood
+        sums = np.empty(self._slot_start[-1], np.float32)
         share_stored(
             self._shared.start, self._blocks, self._first, self._kept, self._left_over, mask, self._slot_start,
-            self._pair, numbered, rest, logs, left_over, sums,
+            self._pair, likelihood, rest, logs, left_over, sums,
         )  # fmt: skip
         parts = label_pairs.add_up(self._slot_start, self._pair, sums, len(likelihood))
         total = np.bincount(mask.present, weights=left_over, minlength=len(rest))
-        return VoteShares(parts.sum(axis=0)[self._number], total, float(logs.sum()))
+        return VoteShares(parts.sum(axis=0), total, float(logs.sum()))
 
 
 class StoringLearner(EMLearner):
     """EM with views that keep their weights."""
 
-    def _prepare(self, view: View, seen: SeenLabels) -> StoredWeights:
-        operator = make_operator(self.scene, view.camera)
-        labels, evidence, _ = self._used_labels(seen, operator)
-        observation = StoredWeights(operator, labels, block_weights(labels, seen.labels))
-        if evidence is not None:
-            observation.evidence = evidence
+    def _prepare(self, view: View, seen: SeenLabels, operator: ViewOperator | None = None) -> StoredWeights:
+        operator = operator or make_operator(self.scene, view.camera)
+        used = self._used_labels(seen, operator)
+        observation = StoredWeights(operator, used.labels, block_weights(used.labels, seen.labels))
+        if used.evidence is not None:
+            observation.evidence = used.evidence
         return observation
 
 

@@ -10,12 +10,10 @@ the default settings, for several changes of a probability that count as moving.
 
 from __future__ import annotations
 
-import argparse
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
-from machine import DATA, describe
+from machine import describe, parser_of
 from workloads import REAL, RoomSize, make_room, true_labels
 
 from gsseg_core.data.dataset import Dataset
@@ -29,8 +27,7 @@ MOVES = (1e-3, 1e-2)
 
 def main() -> None:
     """Measure and print."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--data", type=Path, default=DATA, help="folder of the real scenes")
+    parser = parser_of(__doc__)
     parser.add_argument("--gaussians", type=int, default=1_000_000, help="of the room")
     parser.add_argument("--views", type=int, default=20, help="views of the room")
     options = parser.parse_args()
@@ -72,8 +69,8 @@ def work(
     rows = kept = 0
     for view in spread(list(learner.views.values()), 10):
         observation = learner.observation(view.name)
-        start, records = observation._start, observation._records
-        count = np.concatenate([[0], np.cumsum(moved[observation.ids[observation._entries]])])
+        start, records = observation._tiles.start, observation._records
+        count = np.concatenate([[0], np.cumsum(moved[observation.ids[observation._tiles.entries]])])
         rows += records.sum()
         kept += records[count[start[1:]] > count[start[:-1]]].sum()
     return float(kept / rows)

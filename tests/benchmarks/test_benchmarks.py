@@ -11,6 +11,7 @@ from typing import Any
 import bench
 import calibration
 import children
+import converged
 import growth
 import jobs
 import lift_rate
@@ -90,6 +91,15 @@ def test_work_is_counted_as_the_operator_lists_it() -> None:
     assert work.pairs <= 16 * work.records <= 16 * work.evaluations
     assert work.products == work.records  # With one label only.
     assert work.flops > 17 * 16 * work.evaluations
+
+
+def test_gaussians_that_move_are_told_and_the_work_near_them(capsys: pytest.CaptureFixture[str]) -> None:
+    converged.follow("balls", SCENE, clean_views(3), NUM_CLASSES)
+    title, *steps = capsys.readouterr().out.splitlines()
+    assert title.startswith("balls: steps ") and steps
+    for step in steps:
+        gaussians, work = map(float, step.split("Gaussians, work ")[1].split(" or ")[0].split(", "))
+        assert 0 <= gaussians <= work <= 1
 
 
 def test_peak_is_that_of_the_fastest_spell(monkeypatch: pytest.MonkeyPatch) -> None:
