@@ -56,6 +56,11 @@ class ChildNode:
             raise ChildError(f"{self.module} ended with code {code}; the last line of its log {self.log}: {last}")
         return code == 0
 
+    @property
+    def pid(self) -> int:
+        """Number of its process."""
+        return self._process.pid
+
     def interrupt(self) -> None:
         """Ask it to end."""
         if self._process.poll() is None:
