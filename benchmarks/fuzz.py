@@ -12,7 +12,6 @@ from __future__ import annotations
 
 import argparse
 import contextlib
-import functools
 import io
 import json
 import random
@@ -24,25 +23,17 @@ import time
 from collections import Counter
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 from forked import MOST_MEMORY, Ended, in_child, run_command  # first: it says how numba runs
+from fuzz_inputs import KINDS, NAMES, SEGMENT, STATE, Kind, break_one, filled, plain
 from report import markdown
 
+from gsseg_core.errors import GssegError
+from gsseg_core.live.session import LiveSession
+from gsseg_core.scene.gaussian_scene import GaussianScene
 from gsseg_core.text import printable
 
-if TYPE_CHECKING:
-    from fuzz_inputs import Kind
-
-FILE_KINDS = (
-    "scene.ply", "compressed PLY", "Mip-Splatting PLY", "2DGS PLY", "SPZ 1", "SPZ 2", "SPZ 3", "SPZ 4", "SOG 1",
-    "SOG 2", "SOG meta.json", "splat", "ksplat", "GLB", "glTF", "gsplat checkpoint", "nerfstudio checkpoint",
-    "cameras.json", "transforms.json", "colmap bin", "colmap txt", "OPENCV", "FULL_OPENCV", "fisheye",
-    "bent transforms.json", "dataparser", "labels 8 bit", "labels 16 bit", "soft npz", "mask folder", "classes.json",
-    "split.json", "supervises.json", "COCO polygons", "COCO text", "SAM JSON", "SAM folders", "LabelMe polygons",
-    "LabelMe masks", "ISAT", "CVAT polygons", "CVAT masks", "YOLO", "EISeg images", "EISeg polygons", "SAM 2 video",
-    "Grounded SAM 2", "label map", "segmentation.npz", "state",
-)  # fmt: skip
+FILE_KINDS = tuple(kind.name for kind in KINDS)
 NODE_KINDS = (
     "mask", "camera_info", "pose", "odometry", "image", "segment", "render_view", "load_scene", "save_state",
     "load_state", "export", "learn",
@@ -81,21 +72,10 @@ class Files:
     """Good datasets, of which one file is broken at a time."""
 
     def __init__(self, folder: Path) -> None:
-        from fuzz_inputs import plain
-
         self._folder, self._base = folder, folder / "plain"
         plain(self._base)
         with contextlib.redirect_stdout(io.StringIO()):  # In this process: children then have all that it loads.
-            command = [
-                "segment",
-                self._base / "scene.ply",
-                "--data",
-                self._base,
-                "--out",
-                self._base / "out",
-                "--quiet",
-            ]
-            assert run_command([str(word) for word in command]) == 0
+            assert run_command(filled(SEGMENT, self._base)) == 0
 
     def dataset(self, kind: Kind) -> Path:
         """Make a good dataset with such a file, once, and see that its commands work on it."""
@@ -104,20 +84,17 @@ class Files:
             shutil.copytree(self._base, folder)
             kind.make(folder)
             for command in kind.commands:
-                outcome, ended = self._tried(kind, folder, command)
-                if outcome != "done":
+                data = self._copied(folder)
+                ended = self._run(data, filled(command, data), 600.0)
+                if judge(ended) != "done":
                     raise RuntimeError(f"{kind.name}: {command[0]} fails before anything is broken: {ended.errors}")
         return folder
 
     def broken(self, kind: Kind, name: str, patience: float) -> tuple[str, Ended, str, Path]:
         """Break one file and read it: what came of it, how the child ended, what was done, and the dataset."""
-        from fuzz_inputs import break_one, command_of
-
-        good, data, rng = self.dataset(kind), self._folder / "broken", random.Random(name)
-        shutil.rmtree(data, ignore_errors=True)
-        shutil.copytree(good, data)
+        data, rng = self._copied(self.dataset(kind)), random.Random(name)
         done = break_one(kind, data, rng)
-        command = command_of(kind, data, rng)
+        command = filled(rng.choice(kind.commands), data)
         before = _written(data / "out")
         ended = self._run(data, command, patience)
         outcome = judge(ended)
@@ -125,35 +102,19 @@ class Files:
             outcome = "refused, but results were changed"
         return outcome, ended, f"{done}; gsseg {' '.join(command)}".replace(str(data), "."), data
 
-    def _tried(self, kind: Kind, folder: Path, template: tuple[str, ...]) -> tuple[str, Ended]:
+    def _copied(self, folder: Path) -> Path:
         data = self._folder / "broken"
         shutil.rmtree(data, ignore_errors=True)
         shutil.copytree(folder, data)
-        from dataclasses import replace
-
-        from fuzz_inputs import command_of
-
-        command = command_of(replace(kind, commands=(template,)), data, random.Random(0))
-        ended = self._run(data, command, 600.0)
-        return judge(ended), ended
+        return data
 
     def _run(self, data: Path, command: list[str], patience: float) -> Ended:
-        job = (
-            functools.partial(load_state, data)
-            if command == ["load_state"]
-            else functools.partial(run_command, command)
-        )
-        return in_child(job, self._folder, patience)
+        loads = command == ["load_state"]
+        return in_child(lambda: load_state(data) if loads else run_command(command), self._folder, patience)
 
 
 def load_state(data: Path) -> int:
     """Load a state as the node does, and use it; answers as the command line does."""
-    from fuzz_inputs import NAMES, STATE
-
-    from gsseg_core.errors import GssegError
-    from gsseg_core.live.session import LiveSession
-    from gsseg_core.scene.gaussian_scene import GaussianScene
-
     session = LiveSession(GaussianScene.load(data / "scene.ply"), NAMES)
     try:
         session.load(data / STATE)
@@ -204,8 +165,6 @@ def _written(out: Path) -> dict[str, int]:
 
 def fuzz_files(what: str, files: Files, options: argparse.Namespace) -> Tally:
     """Break files of one kind."""
-    from fuzz_inputs import KINDS
-
     kind, tally, started = next(kind for kind in KINDS if kind.name == what), Tally(what), time.monotonic()
     files.dataset(kind)
     for number in range(options.first, options.first + options.count):
@@ -233,8 +192,6 @@ def _keep(folder: Path, outcome: str, done: str, ended: Ended, data: Path) -> No
 
 def replay(what: str, files: Files, options: argparse.Namespace) -> int:
     """Show one input of one kind again."""
-    from fuzz_inputs import KINDS
-
     kind = next(kind for kind in KINDS if kind.name == what)
     name = f"{options.seed} {what} {options.replay}"
     outcome, ended, done, data = files.broken(kind, name, options.patience)

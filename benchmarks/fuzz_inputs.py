@@ -265,13 +265,7 @@ def break_one(kind: Kind, data: Path, rng: random.Random) -> str:
     return f"{path.name}: {mutation.__name__}"
 
 
-def command_of(kind: Kind, data: Path, rng: random.Random) -> list[str]:
-    """Draw a command that reads such a file."""
-    places = {
-        "scene": data / "scene.ply",
-        "data": data,
-        "out": data / "out",
-        "npz": data / SEGMENTATION,
-        "new": data / "new",
-    }
-    return [word.format(**places) for word in rng.choice(kind.commands)]
+def filled(command: tuple[str, ...], data: Path) -> list[str]:
+    """Fill in the places of a command on a dataset."""
+    places = {"scene": "scene.ply", "data": "", "out": "out", "npz": SEGMENTATION, "new": "new"}
+    return [word.format(**{name: data / place for name, place in places.items()}) for word in command]

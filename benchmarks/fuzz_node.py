@@ -17,6 +17,7 @@ import pytest
 from broken_messages import broken
 from forked import THREADS
 from fuzz import LONGEST_LINE, MOST_MEMORY, Ended, Tally, judge
+from machine import memory_of
 from mutations import any_bytes
 from nav_msgs.msg import Odometry
 from rclpy.serialization import serialize_message
@@ -122,9 +123,8 @@ class FuzzedNode:
     def peak(self) -> int:
         """Most memory that the node has had since the last time that this was asked, in bytes."""
         assert self.robot.process is not None
-        place = Path(f"/proc/{self.robot.process.pid}")
-        peak = int((place / "status").read_text().split("VmHWM:")[1].split()[0]) << 10
-        (place / "clear_refs").write_text("5")
+        peak = memory_of("VmHWM", self.robot.process.pid)
+        Path(f"/proc/{self.robot.process.pid}/clear_refs").write_text("5")
         return peak
 
     def complaints(self) -> list[str]:

@@ -4,18 +4,16 @@ from __future__ import annotations
 
 import functools
 import gzip
-import io
 import json
 import random
 import struct
-import zipfile
 import zlib
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from pathlib import Path
 
 import mutations
 import scene_files
-from mutations import BOMB, Mutation
+from mutations import BOMB, ZEROS, Mutation
 
 from gsseg_core.scene.gaussian_scene import GaussianScene
 from gsseg_core.scene.scene_writers import write_scene
@@ -93,21 +91,19 @@ def _other_header(body: bytes, rng: random.Random) -> bytes:
 @functools.cache
 def _zeros_under_gzip() -> bytes:
     """Pack gigabytes of zeros as a member of a gzip file."""
-    packer, piece = zlib.compressobj(9, wbits=31), bytes(1 << 22)
-    return b"".join([*(packer.compress(piece) for _ in range(BOMB >> 22)), packer.flush()])
+    packer = zlib.compressobj(9, wbits=31)
+    return b"".join([*map(packer.compress, ZEROS), packer.flush()])
 
 
 def zip_members(data: bytes, rng: random.Random) -> bytes:
     """Make a zip whose members are broken one by one: JSON in its values, all else in its bytes."""
-    with zipfile.ZipFile(io.BytesIO(data)) as archive:
-        members = {name: archive.read(name) for name in archive.namelist()}
+    members = mutations.unzipped(data)
     name = rng.choice(sorted(members))
     kind = rng.choice(("content", "content", "content", "drop", "rename", "swap", "bomb"))
     if kind == "content":
         is_json = name.endswith(".json")
-        members[name] = (mutations.json_values if is_json else rng.choice((webp_size, mutations.any_bytes)))(
-            members[name], rng
-        )
+        change = mutations.json_values if is_json else rng.choice((webp_size, mutations.any_bytes))
+        members[name] = change(members[name], rng)
     elif kind == "drop":
         del members[name]
     elif kind == "rename":
@@ -115,23 +111,9 @@ def zip_members(data: bytes, rng: random.Random) -> bytes:
     elif kind == "swap":
         other = rng.choice(sorted(members))
         members[name], members[other] = members[other], members[name]
-    packed = io.BytesIO()
-    with zipfile.ZipFile(packed, "w", zipfile.ZIP_DEFLATED) as archive:
-        for member, content in members.items():
-            info = zipfile.ZipInfo(member)  # With no time of its own: the same draw gives the same bytes.
-            info.compress_type = zipfile.ZIP_DEFLATED
-            if kind == "bomb" and member == name and rng.random() < 0.2:
-                with archive.open(info, "w", force_zip64=True) as file:
-                    for piece in _gigabytes():
-                        file.write(piece)
-            else:
-                archive.writestr(info, content)
-    return packed.getvalue()
-
-
-def _gigabytes() -> Iterator[bytes]:
-    for _ in range(BOMB >> 22):
-        yield bytes(1 << 22)
+    elif rng.random() < 0.2:
+        members[name] = ZEROS
+    return mutations.zipped(members)
 
 
 def webp_size(data: bytes, rng: random.Random) -> bytes:

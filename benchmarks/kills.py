@@ -19,11 +19,11 @@ import statistics
 import sys
 import tempfile
 import time
+from abc import ABC, abstractmethod
 from collections import Counter
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Protocol
 
 from forked import in_child, run_command  # first: it says how numba runs
 from report import markdown
@@ -38,32 +38,31 @@ COLUMNS = ("lost", "broken", "mixed", "unmarked", *THEN, "leftover")
 PATIENCE = 60.0  # s
 
 
-class Victim(Protocol):
+class Victim(ABC):
     """A job that is killed."""
 
+    @abstractmethod
     def seconds(self) -> float:
         """How long it takes if it is left alone."""
-        ...
 
+    @abstractmethod
     def kill(self, delay: float) -> bool:
         """Begin it anew, kill it after so many seconds; returns whether it still ran."""
-        ...
 
+    @abstractmethod
     def faults(self) -> list[Fault]:
         """Say what is wrong with the files as they are."""
-        ...
 
     def faults_after(self) -> list[Fault]:
         """Say what is wrong once the next command, or node, has read them."""
-        ...
+        return self.faults()
 
+    @abstractmethod
     def leftovers(self) -> list[Fault]:
         """Say what lies about once the job has been done again."""
-        ...
 
-    def close(self) -> None:
+    def close(self) -> None:  # noqa: B027 - some have nothing to take down
         """Take everything down."""
-        ...
 
 
 @dataclass
@@ -89,7 +88,7 @@ class Tally:
         return [self.what, str(self.kills), str(self.late), f"{self.seconds:.3f}", *counts]
 
 
-class Segmenting:
+class Segmenting(Victim):
     """`gsseg segment` into a folder that holds an earlier run with other masks."""
 
     def __init__(self, folder: Path) -> None:
@@ -135,9 +134,6 @@ class Segmenting:
         self._run("first", self._out)
         return leftovers(self._out.parent, self._clean)
 
-    def close(self) -> None:
-        pass
-
     def _command(self, name: str, out: Path) -> list[str]:
         labels = {"first": "labels", "second": "turned"}[name]
         arguments = ["--data", self._data, "--out", out, "--labels", labels, "--quiet"]
@@ -150,7 +146,7 @@ class Segmenting:
         return ended.seconds
 
 
-class SavingState:
+class SavingState(Victim):
     """`LiveSession.save` over an earlier state."""
 
     def __init__(self, folder: Path) -> None:
@@ -179,15 +175,9 @@ class SavingState:
     def faults(self) -> list[Fault]:
         return state_faults(self._path, self._sessions["first"].scene, set(self._views.values()))
 
-    def faults_after(self) -> list[Fault]:
-        return self.faults()
-
     def leftovers(self) -> list[Fault]:
         self._save("first")
         return leftovers(self._path.parent, self._clean)
-
-    def close(self) -> None:
-        pass
 
     def _save(self, name: str) -> float:
         ended = in_child(lambda: self._sessions[name].save(self._path) and 0, self._folder, PATIENCE)

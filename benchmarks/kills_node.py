@@ -12,7 +12,7 @@ from typing import Any
 os.environ["ROS_AUTOMATIC_DISCOVERY_RANGE"] = "LOCALHOST"
 
 from forked import THREADS
-from kills import state_faults
+from kills import Victim, state_faults
 from ros_helpers import Ros
 from ros_robot import CLASSES, Robot, core_session, renamed
 from small_scenes import balls_on_a_table, clean_views
@@ -27,7 +27,7 @@ VIEWS = {"first": 3, "second": 30}
 """Views in each of two states, whose masks have other ids, too."""
 
 
-class NodeVictim:
+class NodeVictim(Victim):
     """A node, the folder below which it may write, and two states that it can load there."""
 
     def __init__(self, folder: Path) -> None:
@@ -84,14 +84,7 @@ class NodeVictim:
         return running
 
     def faults(self) -> list[Fault]:
-        found = [fault for name, count in VIEWS.items() for fault in self.state_faults(name, {count})]
-        return found
-
-    def faults_after(self) -> list[Fault]:
-        return self.faults()
-
-    def leftovers(self) -> list[Fault]:
-        return []
+        return [fault for name, count in VIEWS.items() for fault in self.state_faults(name, {count})]
 
     def close(self) -> None:
         self._ros.close()

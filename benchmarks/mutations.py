@@ -6,14 +6,13 @@ Every function takes the bytes of a good file and a generator of random numbers,
 from __future__ import annotations
 
 import copy
-import functools
 import io
 import json
 import random
 import struct
 import zipfile
 import zlib
-from collections.abc import Callable
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -35,6 +34,8 @@ DEEP = 5000
 """Levels of a list in lists: more than a reader that calls itself can take."""
 BOMB = 3 << 30
 """Bytes to which a member of some kilobytes inflates."""
+ZEROS = [bytes(1 << 22)] * (BOMB >> 22)
+"""So many, in pieces that are one and the same."""
 
 
 def any_bytes(data: bytes, rng: random.Random) -> bytes:
@@ -114,19 +115,19 @@ def _dumped(content: Any, rng: random.Random) -> bytes:
 
 def npz_members(data: bytes, rng: random.Random) -> bytes:
     """Members of an npz of other shapes, types and values; those that the zip names are all there, or one too few."""
-    with zipfile.ZipFile(io.BytesIO(data)) as file:
-        members = {name: file.read(name) for name in file.namelist()}
+    members = unzipped(data)
     if not members:
         return data
     name = rng.choice(sorted(members))
-    array = np.load(io.BytesIO(members[name]), allow_pickle=False)
+    content = members[name]
+    array = np.load(io.BytesIO(content), allow_pickle=False)
     kind = rng.choice(("array", "array", "array", "array", "drop", "bytes", "raw", "claim", "rename", "bomb"))
     if kind == "array":
         members[name] = _npy(_changed_array(array, rng))
     elif kind == "drop":
         del members[name]
     elif kind == "bytes":
-        members[name] = any_bytes(members[name], rng)
+        members[name] = any_bytes(content, rng)
     elif kind == "raw":
         members[name] = rng.choice((b"", b"text", b"\x93NUMPY", rng.randbytes(99)))
     elif kind == "claim":
@@ -134,8 +135,8 @@ def npz_members(data: bytes, rng: random.Random) -> bytes:
     elif kind == "rename":
         members[rng.choice(("other.npy", "codes.npy", "../x.npy", "labels_0.npy"))] = members.pop(name)
     elif rng.random() < 0.1:
-        members[name] = b"<bomb>"
-    return _zipped(members)
+        members[name] = _bomb()
+    return zipped(members)
 
 
 def _changed_array(array: np.ndarray, rng: random.Random) -> np.ndarray:
@@ -182,27 +183,31 @@ def _npy(array: np.ndarray) -> bytes:
     return packed.getvalue()
 
 
-def _zipped(members: dict[str, bytes]) -> bytes:
+def unzipped(data: bytes) -> dict[str, Any]:
+    """Read the members of a zip."""
+    with zipfile.ZipFile(io.BytesIO(data)) as file:
+        return {name: file.read(name) for name in file.namelist()}
+
+
+def zipped(members: Mapping[str, bytes | Sequence[bytes]]) -> bytes:
+    """Pack members, some of them in pieces, into a zip."""
     packed = io.BytesIO()
     with zipfile.ZipFile(packed, "w", zipfile.ZIP_DEFLATED) as file:
         for name, content in members.items():
             info = zipfile.ZipInfo(name)  # With no time of its own: the same draw gives the same bytes.
             info.compress_type = zipfile.ZIP_DEFLATED
-            if content != b"<bomb>":
+            if isinstance(content, bytes):
                 file.writestr(info, content)
                 continue
             with file.open(info, "w", force_zip64=True) as member:
-                for piece in _bomb():
-                    member.write(piece)
+                member.writelines(content)
     return packed.getvalue()
 
 
-@functools.cache
 def _bomb() -> list[bytes]:
-    """Pack an array of zeros in pieces; all but the first are one piece, many times."""
+    """Pack an array of zeros, in pieces."""
     start = _npy(np.zeros(0))
-    header = start.replace(b"(0,)", f"({BOMB // 8},)".encode())[: len(start)]
-    return [header, *([bytes(1 << 22)] * (BOMB >> 22))]
+    return [start.replace(b"(0,)", f"({BOMB // 8},)".encode())[: len(start)], *ZEROS]
 
 
 def png_chunks(data: bytes, rng: random.Random) -> bytes:

@@ -29,6 +29,7 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tests/helpers"))
 import numpy as np
 import pytest
 from builtin_interfaces.msg import Time
+from machine import memory_of
 from report import markdown
 from ros_helpers import Process, Ros
 from ros_robot import CLASSES, Robot
@@ -313,8 +314,7 @@ class Day:
         while (left := end - time.monotonic()) > 0:
             time.sleep(min(left, 1.0))
             assert self.robot.process is not None
-            status = Path(f"/proc/{self.robot.process.pid}/status").read_text()
-            mib = int(status.split("VmRSS:")[1].split()[0]) / 1024
+            mib = memory_of("VmRSS", self.robot.process.pid) / 2**20
             self.found.memory.append((time.monotonic() - self._begun, mib))
 
     def _new_client(self) -> SegmentationClient:
