@@ -19,7 +19,6 @@ from workloads import RoomSize, make_room, split, true_labels, write_room
 from gsseg_core import pipeline
 from gsseg_core.data.dataset import Dataset
 from gsseg_core.data.view import View, spread
-from gsseg_core.export.summary import RunSettings
 from gsseg_core.freed_memory import keep_freed_memory
 from gsseg_core.learn.em.em_learner import EMLearner, EMSettings
 from gsseg_core.learn.learner import Learner
@@ -53,7 +52,7 @@ def stages(folder: str, runs: int, sampled: int, labels: str = "labels") -> dict
 
 def command(folder: str, labels: str, out: str) -> dict[str, Any]:
     """Do what `gsseg segment` does; seconds per stage, steps of EM, and peak memory."""
-    report = pipeline.segment(Path(folder) / "scene.ply", folder, out, RunSettings(labels=labels))
+    report = pipeline.segment(Path(folder) / "scene.ply", folder, out, labels=labels)
     return {"seconds": report["seconds"], "steps": len(report["objective"]), "peak": peak_memory()}
 
 

@@ -104,13 +104,12 @@ def run_here(folder: Path, labels: str, device: str, out: str) -> dict[str, Any]
 
     progress.Stopwatch.stage = stage  # type: ignore[method-assign, assignment]
     from gsseg_core import pipeline
-    from gsseg_core.export.summary import RunSettings
     from gsseg_core.warm_up import warm_up
 
     keep_freed_memory()
     warm_up(device)
-    settings = RunSettings(labels=labels, device=device, ids="per-view" if labels == AUTOMATIC else None)
-    report = pipeline.segment(folder / "scene.ply", folder, out, settings)
+    ids = "per-view" if labels == AUTOMATIC else None
+    report = pipeline.segment(folder / "scene.ply", folder, out, labels=labels, device=device, ids=ids)
     return {"wall": wall, "cores": cores, "peak": peak_memory(), "steps": len(report["objective"])}
 
 

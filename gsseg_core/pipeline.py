@@ -30,9 +30,11 @@ from gsseg_core.learn.registry import make_learner
 from gsseg_core.learn.renamed_ids import renamed_ids, renamed_report
 from gsseg_core.learn.usable_views import NO_MASK, SEES_NOTHING
 from gsseg_core.progress import Progress, Stopwatch, silent, with_progress
-from gsseg_core.refine.label_propagation import UNKNOWN_SHARE, propagate
+from gsseg_core.refine.label_propagation import UNKNOWN_SHARE, GraphSettings, propagate
+from gsseg_core.refine.settings import RefineSettings
 from gsseg_core.report.run_files import Assessment, Inputs, write_run
 from gsseg_core.scene.gaussian_scene import GaussianScene
+from gsseg_core.scene.scene_writers import DEFAULT as DEFAULT_FORMAT
 from gsseg_core.segmentation import Segmentation
 from gsseg_core.several_at_once import beside
 from gsseg_core.spatial.neighbour_graph import graph_of
@@ -48,26 +50,42 @@ def segment(
     scene_path: str | os.PathLike[str],  # of any format in `gsseg_core.scene.scene_formats`
     data: str | os.PathLike[str],  # folder of the dataset
     out: str | os.PathLike[str],  # gets `segmentation.npz`, `classes/`, `pictures/`, `report.html` and `report.json`
-    settings: RunSettings | None = None,
     *,
+    labels: str | os.PathLike[str] = "labels",  # sub-folder of masks, or those of another program: docs/formats.md
+    learner: str = "em",  # one of `LEARNERS`
+    views: int | None = None,  # learn from so many train views, spread evenly; from all by default
+    refine: RefineSettings | None = None,  # KNN clustering and carving by default
+    graph: bool = True,  # where views are few, propagate labels: `gsseg_core.refine.label_propagation`
+    device: str = "cpu",
+    memory_budget: int | None = None,  # bytes of prepared views; an eighth of what is free by default: docs/memory.md
+    seed: int = 0,
+    scheduler: str | None = None,  # address of a Dask scheduler whose workers learn; everything else is done here
+    ids: str | None = None,  # one of `IDS`; by default, as the format of the masks has it
+    granularity: float | None = None,  # where the tree of objects is cut for `classes/` and `pictures/`: docs/ids.md
+    scene_format: str = DEFAULT_FORMAT,  # of the files in `classes/`, one of `SCENE_WRITERS`
+    collision: str | None = None,  # kind of meshes of each object, one of `gsseg_core.export.collision.KINDS`
+    label_map: str | os.PathLike[str] | None = None,  # renames, merges and ignores classes: `gsseg_core.data.label_map`
     align: bool = False,  # as for `gsseg_core.align.placing.place`, with `dataparser`: docs/frames.md
     dataparser: str | os.PathLike[str] | None = None,
+    quality: str = "full",  # one of `QUALITIES`: of which pixels of the views to learn: docs/memory.md
     progress: Progress = silent,
 ) -> dict[str, Any]:
     """Learn from train views of a dataset, refine, and write everything into `out`; return what `report.json` holds.
 
     Raises `GssegError` for whatever is wrong with the input; what was in `out` before is whole and unchanged.
     """
-    settings, watch = settings or RunSettings(), Stopwatch()
+    settings = RunSettings(
+        learner, str(labels), views, device, default_budget(device) if memory_budget is None else memory_budget, seed,
+        scheduler, ids, refine or RefineSettings(), GraphSettings() if graph else None, granularity, scene_format,
+        collision, None if label_map is None else str(label_map), quality,
+    )  # fmt: skip
+    watch = Stopwatch()
     settings.check()
-    device, labels, label_map = settings.device, settings.labels, settings.label_map
-    if settings.memory_budget is None:
-        settings = replace(settings, memory_budget=default_budget(device))
     inputs_read = (scene_path, *folders_of(data, labels))
     with staged_run(out, "segment", places=settings.places({}, []), inputs=inputs_read) as run:
         with ExitStack() as workers:
             with watch.stage("load"):
-                client = _connect(settings.scheduler, workers)
+                client = _connect(scheduler, workers)
                 scene, dataset = GaussianScene.load(scene_path), Dataset(data, labels, label_map=label_map)
                 settings = replace(settings, ids=_ids(dataset, settings))
                 settings.check()

@@ -82,27 +82,23 @@ def run(options: argparse.Namespace) -> int:
     """Segment, and print a summary."""
     # The rasteriser's kernels load with the pipeline; `gsseg --help` need not wait for them.
     from gsseg_core import pipeline
-    from gsseg_core.export.summary import RunSettings
-    from gsseg_core.refine.label_propagation import GraphSettings
 
     outer = None if options.no_filter else options.refine
     refine = RefineSettings(
         k=options.k, beta=options.beta, weigh=options.refine != "paper", cluster=not options.no_knn,
         filter=outer == "paper", carve=outer == "carve",
     )  # fmt: skip
-    settings = RunSettings(
-        learner=options.learner, labels=labels_path(options.data, options.labels), views=options.views,
-        device=options.device, memory_budget=None if options.memory_budget is None else options.memory_budget << 20,
-        seed=options.seed, scheduler=options.scheduler, ids=options.ids, refine=refine,
-        graph=None if options.no_graph else GraphSettings(), granularity=options.granularity,
-        scene_format=options.format, collision=options.collision, label_map=options.label_map, quality=options.quality,
-    )  # fmt: skip
     load_kernels(options.quiet, options.device)
     hint = nullcontext() if options.ids else hint_at_own_ids()
     with hint, progress_bars(options.quiet) as progress:
         report = pipeline.segment(
-            options.scene, options.data, options.out, settings,
-            align=options.align, dataparser=options.dataparser, progress=progress,
+            options.scene, options.data, options.out, labels=labels_path(options.data, options.labels),
+            learner=options.learner, views=options.views, refine=refine, graph=not options.no_graph,
+            device=options.device, memory_budget=None if options.memory_budget is None else options.memory_budget << 20,
+            seed=options.seed, scheduler=options.scheduler, ids=options.ids, granularity=options.granularity,
+            label_map=options.label_map,
+            scene_format=options.format, collision=options.collision, align=options.align,
+            dataparser=options.dataparser, quality=options.quality, progress=progress,
         )  # fmt: skip
     from gsseg_core.text import segment_summary
 

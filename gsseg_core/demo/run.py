@@ -9,7 +9,6 @@ import numpy as np
 
 from gsseg_core import pipeline
 from gsseg_core.demo.table_scene import DemoScene, build_demo
-from gsseg_core.export.summary import RunSettings
 from gsseg_core.learn.learner import Progress, silent
 from gsseg_core.learn.registry import check_seed
 from gsseg_core.metrics import evaluate_folders, iou
@@ -25,8 +24,7 @@ def run_demo(out: str | os.PathLike[str], *, seed: int = 0, progress: Progress =
     watch = Stopwatch()
     with watch.stage("build the scene"):
         demo = build_demo(out / "scene", seed)
-    settings = RunSettings(seed=seed)
-    report = pipeline.segment(demo.root / "scene.ply", demo.root, out / "segmented", settings, progress=progress)
+    report = pipeline.segment(demo.root / "scene.ply", demo.root, out / "segmented", seed=seed, progress=progress)
     watch.seconds.update(report["seconds"])
     with watch.stage("render test views"):
         pipeline.render(

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import platform
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass
 from importlib.metadata import version
 from typing import Any
 
@@ -32,21 +32,21 @@ PACKAGES = ("gsseg", "numpy", "scipy", "numba")  # those whose versions a report
 class RunSettings:
     """All that determines a run, as `gsseg_core.pipeline.segment` takes it; `settings` in `report.json`."""
 
-    learner: str = "em"  # one of `LEARNERS`
-    labels: str = "labels"  # sub-folder of masks, or those of another program: docs/formats.md
-    views: int | None = None  # learn from so many train views, spread evenly; from all by default
-    device: str = "cpu"
-    memory_budget: int | None = None  # bytes of prepared views; an eighth of what is free by default: docs/memory.md
-    seed: int = 0
-    scheduler: str | None = None  # address of a Dask scheduler whose workers learn; everything else is done here
-    ids: str | None = None  # one of `IDS`; by default, as the format of the masks has it
-    refine: RefineSettings = field(default_factory=RefineSettings)  # KNN clustering and carving by default
-    graph: GraphSettings | None = field(default_factory=GraphSettings)  # to propagate labels along where views are few
-    granularity: float | None = None  # where the tree of objects is cut for `classes/` and `pictures/`: docs/ids.md
-    scene_format: str = DEFAULT  # of the files in `classes/`, one of `SCENE_WRITERS`
-    collision: str | None = None  # kind of meshes of each object, one of `gsseg_core.export.collision.KINDS`
-    label_map: str | None = None  # file that renames, merges and ignores classes: `gsseg_core.data.label_map`
-    quality: str = "full"  # one of `QUALITIES`: of which pixels of the views to learn: docs/memory.md
+    learner: str
+    labels: str
+    views: int | None
+    device: str
+    memory_budget: int
+    seed: int
+    scheduler: str | None
+    ids: str | None  # None before the masks are opened, where they decide
+    refine: RefineSettings
+    graph: GraphSettings | None  # None where probabilities do not spread along one
+    granularity: float | None = None
+    scene_format: str = DEFAULT
+    collision: str | None = None
+    label_map: str | None = None
+    quality: str = "full"
     learner_settings: Any = None  # those of the learner, if it has any
 
     def places(self, class_names: Mapping[int, str], views: Iterable[View]) -> list[str]:

@@ -17,7 +17,6 @@ from small_scenes import clean_views, write_dataset
 from whole_outputs import faults_of, leftovers, listing, read_folder
 
 from gsseg_core import pipeline
-from gsseg_core.export.summary import RunSettings
 
 BENCHMARKS = Path(__file__).resolve().parents[2] / "benchmarks"
 
@@ -68,7 +67,7 @@ def results_fixture(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Pat
     outs = []
     for labels in ("labels", "turned"):
         outs.append(tmp_path_factory.mktemp(labels) / "out")
-        pipeline.segment(data / "scene.ply", data, outs[-1], RunSettings("votes", labels))
+        pipeline.segment(data / "scene.ply", data, outs[-1], labels=labels, learner="votes")
     return outs[0], outs[1]
 
 

@@ -16,7 +16,6 @@ from gsseg_core.cli.arguments import build_parser
 from gsseg_core.data.label_images import write_mask
 from gsseg_core.data.view import QUALITIES, View
 from gsseg_core.errors import SettingsError
-from gsseg_core.export.summary import RunSettings
 from gsseg_core.scene.camera import Camera, smaller_camera, undistorted_camera
 from gsseg_core.scene.lens import MODELS_BY_NAME, Lens
 from gsseg_core.scene.undistortion import undistortions
@@ -71,7 +70,7 @@ def test_a_view_without_such_a_pixel_stays_as_it_is() -> None:
 @pytest.mark.parametrize("learner", ["em", "votes"])
 def test_half_the_rows_and_columns_find_the_objects(tmp_path: Path, learner: str) -> None:
     data = small_scenes.write_dataset(tmp_path / "data")
-    report = pipeline.segment(data / "scene.ply", data, tmp_path / "out", RunSettings(learner, quality="half"))
+    report = pipeline.segment(data / "scene.ply", data, tmp_path / "out", learner=learner, quality="half")
     assert report["settings"]["quality"] == "half"
     scene, truth = small_scenes.balls_on_a_table()
     assert (Segmentation.load(tmp_path / "out/segmentation.npz", scene).labels == truth).mean() > 0.9
@@ -83,4 +82,4 @@ def test_the_command_offers_the_qualities_there_are_and_others_are_refused(tmp_p
         options = build_parser().parse_args(["segment", "s", "--data", "d", "--out", "o", "--quality", quality])
         assert options.quality == quality
     with pytest.raises(SettingsError, match="quality is 'best'; expected one of full, half, quarter"):
-        pipeline.segment("scene.ply", tmp_path, tmp_path / "out", RunSettings(quality="best"))
+        pipeline.segment("scene.ply", tmp_path, tmp_path / "out", quality="best")

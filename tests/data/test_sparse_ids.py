@@ -21,7 +21,6 @@ from gsseg_core.data.dataset import Dataset
 from gsseg_core.data.label_images import read_mask, write_mask
 from gsseg_core.errors import UnknownLabelError
 from gsseg_core.export.pictures import legend, palette
-from gsseg_core.export.summary import RunSettings
 from gsseg_core.learn.registry import make_learner
 from gsseg_core.raster.backends import make_operator
 from gsseg_core.scene.gaussian_scene import GaussianScene
@@ -52,7 +51,7 @@ def runs(tmp_path_factory: pytest.TempPathFactory) -> Path:
     with_gaps(root / "gaps")
     with_gaps(root / "nameless", names=False)
     for name in ("dense", "gaps", "nameless"):
-        pipeline.segment(root / name / "scene.ply", root / name, root / name / "out")
+        pipeline.segment(root / name / "scene.ply", root / name, root / name / "out", learner="em")
     return root
 
 
@@ -146,7 +145,7 @@ def test_one_stray_pixel_of_the_largest_id_takes_no_memory(tmp_path: Path) -> No
     labels[0, 0] = 65534
     write_mask(folder / "labels/view0.png", labels, 16)
     before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
-    pipeline.segment(folder / "scene.ply", folder, tmp_path / "out", RunSettings("votes"))
+    pipeline.segment(folder / "scene.ply", folder, tmp_path / "out", learner="votes")
     # Votes alone were 626 x 65535 x 8 bytes.
     assert resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before < 150_000
     with np.load(tmp_path / "out/segmentation.npz") as file:

@@ -11,7 +11,6 @@ import numpy as np
 from small_scenes import NUM_CLASSES, balls_on_a_table, clean_views, ring, taught, write_dataset
 
 from gsseg_core import pipeline
-from gsseg_core.export.summary import RunSettings
 from gsseg_core.learn.em.em_learner import EMLearner
 from gsseg_core.learn.mask_reliability import check_views
 from gsseg_core.report.findings import MaskChecks
@@ -32,7 +31,7 @@ def run_with_nasty_names(folder: Path, **options: Any) -> Path:
     """Segment the balls; returns the folder of results."""
     scene, truth = balls_on_a_table()
     data = write_dataset(folder / "data", scene, truth, ring(9), NASTY)
-    pipeline.segment(data / "scene.ply", data, folder / "out", RunSettings(**options))
+    pipeline.segment(data / "scene.ply", data, folder / "out", **options)
     return folder / "out"
 
 

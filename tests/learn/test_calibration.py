@@ -16,7 +16,6 @@ from small_scenes import NAMES, NUM_CLASSES, balls_on_a_table, ring, taught, wri
 from gsseg_core.data.label_images import UNKNOWN
 from gsseg_core.data.view import View
 from gsseg_core.export.class_files import export_classes
-from gsseg_core.export.summary import RunSettings
 from gsseg_core.learn import temperature as fitting
 from gsseg_core.learn.calibrate import calibrate
 from gsseg_core.learn.em.em_learner import EMLearner
@@ -316,7 +315,7 @@ def test_plys_carry_label_and_confidence_of_the_segmentation_and_of_it_alone(tmp
 
 def test_the_report_says_how_the_files_of_the_command_were_calibrated(tmp_path: Path) -> None:
     data, out = write_dataset(tmp_path / "data"), tmp_path / "out"
-    found = segment(data / "scene.ply", data, out, RunSettings("votes"))["calibration"]
+    found = segment(data / "scene.ply", data, out, learner="votes")["calibration"]
     assert found == json.loads((out / "report.json").read_text())["calibration"]
     assert found["views"] == 4 and found["pixels"] > 0 and found["held_out"]
     result = Segmentation.load(out / "segmentation.npz", GaussianScene.load(data / "scene.ply"))

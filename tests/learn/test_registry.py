@@ -16,7 +16,6 @@ from small_scenes import NUM_CLASSES, balls_on_a_table, clean_views, write_datas
 
 from gsseg_core.cli.arguments import build_parser
 from gsseg_core.errors import SettingsError
-from gsseg_core.export.summary import RunSettings
 from gsseg_core.learn.learner import Learner
 from gsseg_core.learn.registry import LEARNERS, Entry, check_learner, distributed_learners, make_learner
 from gsseg_core.learn.vote_learner import VoteLearner
@@ -90,7 +89,7 @@ def test_a_learner_in_the_table_is_in_the_errors(toy: None) -> None:
 
 def test_a_learner_in_the_table_segments_and_is_reported(toy: None, tmp_path: Path) -> None:
     data, out = write_dataset(tmp_path / "data"), tmp_path / "out"
-    report = segment(data / "scene.ply", data, out, RunSettings("toy"))
+    report = segment(data / "scene.ply", data, out, learner="toy")
     assert report == json.loads((out / "report.json").read_text())
     assert report["settings"]["learner"] == "toy" and report["calibration"]["held_out"]
     assert len(report["views"]["reliability"]) == report["views"]["used"] > 0

@@ -19,7 +19,6 @@ from small_scenes import NAMES, look_at, many_classes, ring, write_dataset
 from gsseg_core import pipeline
 from gsseg_core.data.dataset import Dataset
 from gsseg_core.data.label_images import write_mask
-from gsseg_core.export.summary import RunSettings
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -370,7 +369,7 @@ def test_levels_recolour_the_preview_and_parts_stand_under_their_object(
     for i, view in enumerate(Dataset(data).views("train")):
         labels = seen_as(view, halved(1) if i % 2 else TRUTH).read_labels()
         write_mask(data / "labels" / f"{view.name}.png", labels, 8)
-    pipeline.segment(data / "scene.ply", data, folder / "out", RunSettings("votes", ids="per-view"))
+    pipeline.segment(data / "scene.ply", data, folder / "out", ids="per-view", learner="votes")
     page.goto((folder / "out/report.html").as_uri())
     page.wait_for_selector(f"{CANVAS}[data-frames]")
     rows = page.locator(".legend li:visible bdi")
