@@ -27,9 +27,8 @@ from gsseg_core.learn.vote_learner import VoteLearner
 from gsseg_core.learn.vote_resolution import resolved_votes
 from gsseg_core.objects import association_kernels, move_kernels, tree_kernels
 from gsseg_core.objects.clicks import merge_tree
-from gsseg_core.objects.convex_hull import hull_faces
 from gsseg_core.objects.heaviest import heaviest
-from gsseg_core.objects.rectangles import rectangles_around
+from gsseg_core.objects.hulls import hull_faces, rectangles_around
 from gsseg_core.raster.backends import make_operator
 from gsseg_core.raster.cpu.occlusion import ray_ends
 from gsseg_core.raster.depth import surface

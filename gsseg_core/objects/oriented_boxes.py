@@ -181,7 +181,7 @@ def _turned(offsets: Array, share: Array, axes: Array) -> Array:
 
     It begins with the axes given, and with the sides of the points' hull.
     """
-    from gsseg_core.objects.convex_hull import hull_faces  # Who reads boxes only, as a client does, starts without.
+    from gsseg_core.objects.hulls import hull_faces  # Who reads boxes only, as a client does, starts without.
 
     along = offsets @ axes
     low, high = _quantile(along, share, TRIM), -_quantile(-along, share, TRIM)
@@ -243,7 +243,7 @@ def _turned_about(points: Array, axes: Array, k: int) -> Array:
 
 def _smallest_rectangle(points: Array) -> tuple[float, float, float]:
     """Direction x, y of a side of the smallest rectangle around points (M, 2); its area by that of the upright one."""
-    from gsseg_core.objects.rectangles import rectangles_around
+    from gsseg_core.objects.hulls import rectangles_around
 
     spans = np.ptp(points, axis=0)
     if spans.min() <= _TIED * spans.max():  # Seen edge on: there is nothing to make smaller.

@@ -62,7 +62,7 @@ def looks_alike(
     return _view(camera, click_labels(scene, camera, [_pixel(camera, column, row)], device=device) == 1, label)
 
 
-class Drawn(NamedTuple):
+class Correction(NamedTuple):
     """What a correction says of the M Gaussians that it sees, in P pairs of a Gaussian and a label."""
 
     ids: np.ndarray  # (P,) int32: Gaussian of each pair
@@ -84,7 +84,7 @@ class Corrections:
 
     def __init__(self, scene: GaussianScene, *, device: str = "cpu") -> None:
         self._scene, self._device = scene, device
-        self.drawn: tuple[Drawn, ...] = ()  # what each says
+        self.drawn: tuple[Correction, ...] = ()  # what each says
 
     def __len__(self) -> int:
         """Count the corrections."""
@@ -147,7 +147,7 @@ class Corrections:
         return Labelling(labels, shares, {k: class_name(known, k) for k in range(num_classes)})
 
 
-def drawn_on(scene: GaussianScene, view: View, shown: np.ndarray | None = None, device: str = "cpu") -> Drawn:
+def drawn_on(scene: GaussianScene, view: View, shown: np.ndarray | None = None, device: str = "cpu") -> Correction:
     """Lift the labels of a view onto the Gaussians that are shown, (N,) bool, as if there were no others."""
     operator, labels = make_operator(scene, view.camera, device), view.read_labels()
     if shown is not None:
@@ -157,7 +157,7 @@ def drawn_on(scene: GaussianScene, view: View, shown: np.ndarray | None = None, 
     full[operator.ids] = operator.footprints()
     weights = operator.adjoint((labels != UNKNOWN)[..., None].astype(np.float32))[observed.ids, 0]
     seen[observed.start[:-1]] = np.minimum(weights / full[observed.ids], 1)
-    return Drawn(observed.ids[observed.rows], observed.classes[observed.labels], observed.votes(), seen)
+    return Correction(observed.ids[observed.rows], observed.classes[observed.labels], observed.votes(), seen)
 
 
 def _view(camera: Camera, drawn: np.ndarray, label: int) -> View:

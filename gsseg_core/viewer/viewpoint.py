@@ -29,8 +29,7 @@ class Viewpoint:
         if state.views:
             poses = np.array([np.linalg.inv(view.camera.world_to_camera) for view in state.views])
             server.scene.set_up_direction(-poses[:, :3, 1].mean(axis=0))
-            start.position, start.look_at = poses[0, :3, 3], poses[0, :3, 3] + poses[0, :3, 2] * self._reach
-            start.fov = _vertical_fov(state.views[0].camera)
+            self._look(start, state.views[0], poses[0])
         else:
             start.look_at = (low + high) / 2
             start.position = (low + high) / 2 + np.array([1.2, 1.2, 0.9]) * self._reach
@@ -42,13 +41,16 @@ class Viewpoint:
         pose = np.linalg.inv(view.camera.world_to_camera)
         with client.atomic():
             client.camera.up_direction = -pose[:3, 1]
-            client.camera.position = pose[:3, 3]
-            client.camera.look_at = pose[:3, 3] + pose[:3, 2] * self._reach
-            client.camera.fov = _vertical_fov(view.camera)
+            self._look(client.camera, view, pose)
         self.hide_mask(client)
         if with_mask:
             self._hang(client, view, pose)
             client.flush()
+
+    def _look(self, through: viser.InitialCameraConfig | viser.CameraHandle, view: View, pose: np.ndarray) -> None:
+        """Have a browser look from where a view was taken, of which the pose (4, 4) is camera to world."""
+        through.position, through.look_at = pose[:3, 3], pose[:3, 3] + pose[:3, 2] * self._reach
+        through.fov = float(2 * np.arctan(view.camera.height / 2 / view.camera.fy))  # vertical, in radians
 
     def hide_mask(self, client: viser.ClientHandle) -> None:
         """Take the mask off the picture of a browser."""
@@ -84,8 +86,3 @@ def camera_of(client: viser.ClientHandle, most_rows: int | None = None) -> Camer
     pose: np.ndarray = rigid_motion(vtf.SO3(seen.wxyz).as_matrix(), seen.position)
     K = np.array([[focal, 0, width / 2], [0, focal, height / 2], [0, 0, 1]])
     return Camera("viewer", width, height, K, np.linalg.inv(pose))
-
-
-def _vertical_fov(camera: Camera) -> float:
-    """Field of view in radians, as viser takes it."""
-    return float(2 * np.arctan(camera.height / 2 / camera.fy))
