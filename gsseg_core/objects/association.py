@@ -163,7 +163,7 @@ def _merged(
         changed = np.flatnonzero(~unchanged)
         clusters = clusters.merged(number)
         votes = votes.replaced(alive[unchanged], changed, _Votes.of(clusters, changed, voters, votes.doubt))
-        pairs = pairs.among(number, unchanged).and_(votes.pairs(changed, clusters.borders, surface, level))
+        pairs = pairs.among(number, unchanged).plus(votes.pairs(changed, clusters.borders, surface, level))
     return clusters, votes
 
 
@@ -180,7 +180,7 @@ class _Pairs(NamedTuple):
         kept = unchanged[first] & unchanged[second]
         return _Pairs(first[kept], second[kept], self.score[kept])
 
-    def and_(self, others: _Pairs) -> _Pairs:
+    def plus(self, others: _Pairs) -> _Pairs:
         """Add others."""
         return _Pairs(*(np.concatenate(both) for both in zip(self, others, strict=True)))
 

@@ -86,19 +86,14 @@ class Profiles:
         weights.eliminate_zeros()
         return cls(weights.tocsr())
 
-    def copy(self) -> Profiles:
-        """Return another one like it, in no more memory."""
-        other = Profiles(self._sum)
-        other._more = list(self._more)
-        return other
-
     def add(self, segments: Lifted, objects: np.ndarray) -> None:  # (L,)
         """Add the segments of a view to their objects."""
         part = (grouping(objects) @ segments.weights.astype(np.float64)).tocoo()
         at = segments.gaussians[part.col], part.row
         if sum(more.nnz for more in self._more) > self._sum.nnz:  # Nobody may ask for the sum, view after view.
             self._add_up()
-        self._more.append(sparse.coo_matrix((part.data, at), shape=(len(self), part.shape[0])))
+        # Another list: copies have their own, in no more memory.
+        self._more = [*self._more, sparse.coo_matrix((part.data, at), shape=(len(self), part.shape[0]))]
 
     def renumbered(self, objects: np.ndarray) -> Profiles:  # (K,)
         """Give the objects other numbers; those that get the same one become one."""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from copy import copy
 from dataclasses import asdict, dataclass, replace
 from typing import Any
 
@@ -113,7 +114,7 @@ class ObjectTable:
     def checkpoint(self) -> Undo:
         """Return what goes back to the present state, after `add`, `match`, `remove` or `solve`; not after `forget`."""
         copies = {name: dict(getattr(self, name)) for name in ("views", "_lifted", "_objects")}
-        return checkpoint(self, **copies, _profiles=self._profiles.copy())
+        return checkpoint(self, **copies, _profiles=copy(self._profiles))
 
     def adopt(self, view: View) -> Observation | None:
         """Add a view whose ids are the numbers of objects already; returns it lifted, None where `add` tells False."""

@@ -20,6 +20,7 @@ from gsseg_core.data.view import View
 from gsseg_core.errors import SettingsError
 from gsseg_core.export.class_files import write_selection
 from gsseg_core.export.collision import check_collision
+from gsseg_core.learn.all_or_nothing import all_or_nothing, checkpoint
 from gsseg_core.progress import Progress, silent
 from gsseg_core.raster.backends import make_operator
 from gsseg_core.scene.camera import Camera
@@ -73,7 +74,8 @@ class ViewerState:
                     "view reliability is not known; expected --data, and a report.json of `gsseg segment --learner em` "
                     "beside the segmentation"
                 )
-            self.model.reliability = self.view_votes(progress).mean_reliability(self.reliability)
+            mean = self.view_votes(progress).mean_reliability(self.reliability)
+            self.change(lambda model: setattr(model, "reliability", mean))
         self.change(lambda model: setattr(model, "mode", mode))
 
     def set_level(self, granularity: float, inside: int | None = None) -> None:
@@ -204,15 +206,9 @@ class ViewerState:
     @contextmanager
     def _relabelling(self) -> Iterator[None]:
         """Change the corrections or what was learnt, and show what follows; where that fails, nothing has changed."""
-        model, corrections = self.model, self.corrections
-        with self.lock:
-            before = corrections.drawn, self._learnt, self.added_names, model.hidden, model.removed
-            try:
-                yield
-                self._relabel(self.granularity)
-            except BaseException:
-                corrections.drawn, self._learnt, self.added_names, model.hidden, model.removed = before
-                raise
+        with self.lock, all_or_nothing(*map(checkpoint, (self, self.model, self.corrections))):
+            yield
+            self._relabel(self.granularity)
 
     def _relabel(self, granularity: float) -> None:
         """Show what follows from the corrections, at a level; all of it, or nothing where memory runs out."""
