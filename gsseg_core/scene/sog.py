@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 import json
+import os
 import zipfile
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -25,7 +26,7 @@ from gsseg_core.text import quoted
 
 _META = "meta.json"
 _EXPECTED = "a SOG scene"
-_PER_ROW = 64  # entries of the palette of SH in a row of its image
+PER_ROW = 64  # entries of the palette of SH in a row of its image
 # Bytes of an image: of four per pixel at most, for four pixels per Gaussian, or for the palette of SH.
 _PER_GAUSSIAN, _PER_IMAGE = 16, 1 << 23
 
@@ -42,7 +43,7 @@ def is_sog(head: bytes) -> bool:
 
 def read_sog(path: Path, within: Path | None = None) -> ReadScene:
     """Read a SOG scene: a zip, the `meta.json` of a folder, or that folder."""
-    if path.is_dir():
+    if os.path.isdir(path):  # Unlike `Path.is_dir`, false where one may not even look.
         path = path / _META
     with open_scene(path, within, _EXPECTED) as file:
         if file.peek(2)[:2] != b"PK":
@@ -166,8 +167,8 @@ def _rest(meta: Any, labels: Pixels, load: Load) -> npt.NDArray[np.floating]:
     """Coefficients (N, B, 3) of SH above degree 0: each Gaussian names an entry of a palette."""
     with _image(meta["files"][0], load, len(labels)) as image:
         palette = np.asarray(image.convert("RGB"))
-    coefficients = palette.shape[1] // _PER_ROW
-    if coefficients not in (3, 8, 15) or palette.shape[1] % _PER_ROW:
+    coefficients = palette.shape[1] // PER_ROW
+    if coefficients not in (3, 8, 15) or palette.shape[1] % PER_ROW:
         raise UnfitError(f"has a palette of SH {palette.shape[1]} pixels wide; expected 192, 512 or 960")
     entries = palette.reshape(-1, coefficients, 3)
     index = labels[:, 0].astype(np.int64) | labels[:, 1].astype(np.int64) << 8

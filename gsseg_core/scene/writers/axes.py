@@ -7,8 +7,6 @@ of each quaternion, and of those spherical harmonics that are odd in them. So it
 
 from __future__ import annotations
 
-from typing import NamedTuple
-
 import numpy as np
 import numpy.typing as npt
 
@@ -18,19 +16,14 @@ from gsseg_core.scene.gaussian_scene import GaussianScene
 HALF_TURN_X, HALF_TURN_Z = (1, -1, -1), (-1, -1, 1)  # signs of x, y, z after half a turn about x or z
 
 
-class Turned(NamedTuple):
-    """What turns with a scene: centres (N, 3), quaternions w, x, y, z (N, 4), harmonics (N, (d + 1)^2, 3); float32."""
+def turned(scene: GaussianScene, signs: tuple[int, int, int]) -> tuple[npt.NDArray[np.float32], ...]:
+    """Turn a scene by half a turn, whose `signs` are those of x, y, z after it.
 
-    means: npt.NDArray[np.float32]
-    quats: npt.NDArray[np.float32]
-    sh: npt.NDArray[np.float32]
-
-
-def turned(scene: GaussianScene, signs: tuple[int, int, int]) -> Turned:
-    """Turn a scene by half a turn, whose `signs` are those of x, y, z after it."""
+    Returns centres (N, 3), quaternions w, x, y, z (N, 4) and harmonics (N, (d + 1)^2, 3), all float32.
+    """
     xyz = np.array(signs, np.float32)
     parity = np.diag(spherical_harmonics.turned(np.diag(signs), scene.sh_degree)).astype(np.float32)
-    return Turned(scene.means * xyz, scene.quats * np.array((1, *signs), np.float32), scene.sh * parity[:, None])
+    return scene.means * xyz, scene.quats * np.array((1, *signs), np.float32), scene.sh * parity[:, None]
 
 
 def logits_of_bytes(scene: GaussianScene) -> npt.NDArray[np.float32]:

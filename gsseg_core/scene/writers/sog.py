@@ -18,9 +18,9 @@ import numpy.typing as npt
 from PIL import Image
 
 from gsseg_core.scene.gaussian_scene import GaussianScene
+from gsseg_core.scene.sog import PER_ROW
 
 LARGEST_PALETTE = 1 << 16  # entries of the palette of harmonics; a scene of no more Gaussians loses nothing by it
-_PER_ROW = 64  # entries of the palette of harmonics in a row of its image
 _COARSE, _STEPS = 256, 2  # clusters that the palette is divided into, and steps of k-means
 _AT_ONCE = 1 << 12
 _SAMPLE = 1 << 20  # values, about, that a code book is fitted to
@@ -32,34 +32,32 @@ def write_sog(path: Path, scene: GaussianScene, run: str | None) -> None:
     asset = {"generator": "gsseg", **({} if run is None else {"gsseg_run": run})}
     meta: dict[str, Any] = {"version": 2, "asset": asset, "count": len(scene)}
 
+    def put(part: str, files: dict[str, npt.NDArray[np.uint8]], **numbers: object) -> None:
+        images.update(files)
+        meta[part] = {**numbers, "files": list(files)}
+
     logs = np.sign(scene.means) * np.log1p(np.abs(scene.means).astype(np.float64))
     low, high = logs.min(axis=0), logs.max(axis=0)
     steps = np.rint((logs - low) / np.where(high > low, high - low, 1) * 65535).astype(np.uint16)
-    images["means_l.webp"], images["means_u.webp"] = _pixels(steps & 255), _pixels(steps >> 8)
-    meta["means"] = {"mins": low.tolist(), "maxs": high.tolist(), "files": ["means_l.webp", "means_u.webp"]}
-
+    halves = {"means_l.webp": _pixels(steps & 255), "means_u.webp": _pixels(steps >> 8)}
+    put("means", halves, mins=low.tolist(), maxs=high.tolist())
     book, codes = _coded(np.log(scene.scales))
-    images["scales.webp"] = _pixels(codes)
-    meta["scales"] = {"codebook": book, "files": ["scales.webp"]}
-
-    images["quats.webp"] = _pixels(_smallest_three(scene.quats))
-    meta["quats"] = {"files": ["quats.webp"]}
-
+    put("scales", {"scales.webp": _pixels(codes)}, codebook=book)
+    put("quats", {"quats.webp": _pixels(_smallest_three(scene.quats))})
     book, codes = _coded(scene.sh[:, 0])
     alpha = np.rint(scene.opacities * 255).clip(1, 254)  # so that its logit is finite
-    images["sh0.webp"] = _pixels(np.concatenate([codes, alpha[:, None]], axis=1))
-    meta["sh0"] = {"codebook": book, "files": ["sh0.webp"]}
-
+    put("sh0", {"sh0.webp": _pixels(np.concatenate([codes, alpha[:, None]], axis=1))}, codebook=book)
     terms = scene.sh.shape[1] - 1
     if terms:
         palette, index = _palette(np.ascontiguousarray(scene.sh[:, 1:].reshape(len(scene), -1)))
         book, codes = _coded(palette)
-        rows = np.zeros((-(-len(palette) // _PER_ROW) * _PER_ROW, 3 * terms), np.uint8)
+        rows = np.zeros((-(-len(palette) // PER_ROW) * PER_ROW, 3 * terms), np.uint8)
         rows[: len(palette)] = codes
-        images["shN_centroids.webp"] = rows.reshape(-1, _PER_ROW * terms, 3)
-        images["shN_labels.webp"] = _pixels(np.stack([index & 255, index >> 8], axis=1))
-        meta["shN"] = {"count": len(palette), "bands": scene.sh_degree, "codebook": book,
-                       "files": ["shN_centroids.webp", "shN_labels.webp"]}  # fmt: skip
+        files = {
+            "shN_centroids.webp": rows.reshape(-1, PER_ROW * terms, 3),
+            "shN_labels.webp": _pixels(np.stack([index & 255, index >> 8], axis=1)),
+        }
+        put("shN", files, count=len(palette), bands=scene.sh_degree, codebook=book)
     with zipfile.ZipFile(path, "w") as archive:
         # By a name alone, zipfile takes the time of now, which on a machine without a clock is too early for it.
         archive.writestr(zipfile.ZipInfo("meta.json"), json.dumps(meta))
