@@ -24,7 +24,6 @@ class SceneWriter(NamedTuple):
     apart) and the id of a run or None.
     """
 
-    name: str  # what messages call it
     suffixes: tuple[str, ...]  # of its files; the first is what gsseg gives them
     write: str = ""  # its function as "module:function", imported when it is used; "" is `GaussianScene.save`
     extra: str = ""  # the extra of gsseg with the library that this needs, if it needs one
@@ -43,15 +42,13 @@ class SceneObject(NamedTuple):
 _WRITERS = "gsseg_core.scene.writers"
 
 SCENE_WRITERS = {
-    "ply": SceneWriter("3DGS PLY", (".ply",)),
-    "compressed-ply": SceneWriter(
-        "compressed PLY", (".compressed.ply",), f"{_WRITERS}.compressed_ply:write_compressed_ply", "formats"
-    ),
-    "spz": SceneWriter("SPZ", (".spz",), f"{_WRITERS}.spz:write_spz", "formats"),
-    "sog": SceneWriter("SOG", (".sog",), f"{_WRITERS}.sog:write_sog"),
-    "splat": SceneWriter(".splat", (".splat",), f"{_WRITERS}.splat:write_splat"),
-    "glb": SceneWriter("GLB", (".glb",), f"{_WRITERS}.glb:write_glb"),
-    "usd": SceneWriter("USD", (".usdc", ".usd", ".usda"), f"{_WRITERS}.usd:write_usd", "usd", together=True),
+    "ply": SceneWriter((".ply",)),
+    "compressed-ply": SceneWriter((".compressed.ply",), f"{_WRITERS}.compressed_ply:write_compressed_ply", "formats"),
+    "spz": SceneWriter((".spz",), f"{_WRITERS}.spz:write_spz", "formats"),
+    "sog": SceneWriter((".sog",), f"{_WRITERS}.sog:write_sog"),
+    "splat": SceneWriter((".splat",), f"{_WRITERS}.splat:write_splat"),
+    "glb": SceneWriter((".glb",), f"{_WRITERS}.glb:write_glb"),
+    "usd": SceneWriter((".usdc", ".usd", ".usda"), f"{_WRITERS}.usd:write_usd", "usd", together=True),
 }
 """Every format by the name that options have for it; the first is the default."""
 
