@@ -190,6 +190,8 @@ def test_entities_of_xml_are_never_expanded(tmp_path: Path) -> None:
         refused(tmp_path, "a.xml", f"{tmp_path}/a.xml: ")
         (tmp_path / "a.xml").write_text(f"<annotations>{doctype}</annotations>")
         refused(tmp_path, "a.xml", "not valid XML")
+        (tmp_path / "a.xml").write_text(f"<!-- > <annotations -->{doctype}<annotations>&l11;</annotations>")
+        refused(tmp_path, "a.xml", "has a document type declaration")
 
 
 @pytest.mark.parametrize("encoding", ["gb2312", "klingon"])
