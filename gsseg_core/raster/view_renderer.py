@@ -47,9 +47,9 @@ class Strongest(NamedTuple):
     beside: Blended | None = None  # what else was blended, if anything
 
     @classmethod
-    def of(cls, image: np.ndarray, grid: PixelGrid = NO_PIXELS, beside: Blended | None = None) -> Strongest:
+    def of(cls, image: np.ndarray, grid: PixelGrid) -> Strongest:
         """Find the strongest class of each pixel of an image of probabilities, (H, W, K)."""
-        return cls(image.argmax(axis=2).astype(np.int32), image.sum(axis=2) > 0.5, grid.of(image), beside)
+        return cls(image.argmax(axis=2).astype(np.int32), image.sum(axis=2) > 0.5, grid.of(image))
 
     def labels(self) -> np.ndarray:
         """Class of each pixel of which more than half is known, (H, W) int32; `UNKNOWN` elsewhere."""
@@ -110,36 +110,31 @@ class ViewRenderer(ABC):
         """Blend codes (M, K) of `ids` alone into the pixels of a grid, (R, C, K) and (R, C); raises as `render`."""
         return Blended(*map(grid.of, self.blend_seen(codes)))
 
-    def blend_rows(self, codes: CSRRows, num_classes: int, of: np.ndarray | None = None) -> Blended:
-        """Blend sparse codes, (N, K); raises as `render` does.
+    @abstractmethod
+    def blend_rows(self, codes: CSRRows, num_classes: int) -> Blended:
+        """Blend sparse codes, (N, K); raises as `render` does."""
 
-        Where they are of some Gaussians alone, (R, K), `of` says of which, (R,) distinct: all of `ids` are among them.
-        """
-        return self.blend_seen(codes.take(self._rows(codes, num_classes, of)).dense(num_classes))
-
-    def blend_probabilities(
-        self, codes: CSRRows, num_classes: int, background: bool, of: np.ndarray | None = None
-    ) -> np.ndarray:
-        """Blend class probabilities, as `blend_rows` takes codes: (H, W, K) float32.
+    def blend_probabilities(self, codes: CSRRows, num_classes: int, background: bool) -> np.ndarray:
+        """Blend class probabilities, sparse, (N, K): (H, W, K) float32.
 
         What a ray has left over is `background`, class 0, or else nothing, so that a pixel sums to what is known of it.
         """
-        image, left_over = self.blend_rows(codes, num_classes, of)
+        image, left_over = self.blend_rows(codes, num_classes)
         if background:
             image[..., 0] += left_over
         return image
 
+    @abstractmethod
     def strongest(
         self, codes: CSRRows, num_classes: int, background: bool, grid: PixelGrid = NO_PIXELS,
         of: np.ndarray | None = None, beside: np.ndarray | None = None, wanted: np.ndarray | None = None,
     ) -> Strongest:  # fmt: skip
         """Find the class of each pixel: that of the largest of `blend_probabilities`.
 
+        Where codes are of some Gaussians alone, (R, K), `of` says of which, (R,) distinct: all of `ids` are among them.
         Codes `beside` these, (M, C) of `ids`, as colours, are blended in the same pass, as `blend_seen` does. If only
         some pixels are `wanted`, (H, W) bool, others may have any value.
         """
-        image = self.blend_probabilities(codes, num_classes, background, of)
-        return Strongest.of(image, grid, None if beside is None else self.blend_seen(beside))
 
     def _rows(self, codes: CSRRows, num_classes: int, of: np.ndarray | None) -> np.ndarray:
         """Check sparse codes, and tell which of their rows each of `ids` has, (M,) int32."""

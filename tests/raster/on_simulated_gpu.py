@@ -237,7 +237,7 @@ SOME = np.arange(2, dtype=np.int32)  # of the Gaussians
 REFUSED: dict[str, Callable[[ViewOperator, CSRRows], Any]] = {
     "codes of too many classes": lambda operator, codes: operator.blend_rows(codes, CLASSES - 1),
     "strongest of too many classes": lambda operator, codes: operator.strongest(codes, CLASSES - 1, True),
-    "codes of some": lambda operator, codes: operator.blend_rows(codes.take(SOME), CLASSES, SOME),
+    "codes of some": lambda operator, codes: operator.strongest(codes.take(SOME), CLASSES, True, of=SOME),
     "wanted of another size": lambda operator, codes: operator.strongest(codes, CLASSES, True, wanted=MASK[1:] > 0),
     "pixels of another size": lambda operator, _: operator.blend_seen(np.ones((len(operator.ids), 1)), MASK[1:] > 0),
     "labels of some": lambda operator, _: operator.objects_alone(SOME),

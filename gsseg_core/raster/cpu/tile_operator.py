@@ -75,9 +75,9 @@ class TileOperator(ViewOperator):
         self._check_rows(len(codes), self.ids)
         return Blended(*render_grid(self._tiles, np.ascontiguousarray(codes, np.float32), *grid))
 
-    def blend_rows(self, codes: CSRRows, num_classes: int, of: np.ndarray | None = None) -> Blended:
+    def blend_rows(self, codes: CSRRows, num_classes: int) -> Blended:
         """Blend codes without their zeros."""
-        return Blended(*products.render(self._tiles, codes, self._rows(codes, num_classes, of), num_classes))
+        return Blended(*products.render(self._tiles, codes, self._rows(codes, num_classes, None), num_classes))
 
     def strongest(
         self, codes: CSRRows, num_classes: int, background: bool, grid: PixelGrid = NO_PIXELS,

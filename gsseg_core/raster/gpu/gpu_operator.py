@@ -75,9 +75,9 @@ class GPUOperator(ViewOperator):
         self._check_rows(len(codes), self.ids, wanted)
         return _to_cpu(*self.blend_there(on_device(codes.astype(np.float32, copy=False), self._device)))
 
-    def blend_rows(self, codes: CSRRows, num_classes: int, of: np.ndarray | None = None) -> Blended:
+    def blend_rows(self, codes: CSRRows, num_classes: int) -> Blended:
         """Blend codes of which only the entries that are not zero are at hand."""
-        return _to_cpu(*self.blend_there(self._dense(codes, num_classes, of)))
+        return _to_cpu(*self.blend_there(self._dense(codes, num_classes, None)))
 
     def strongest(
         self, codes: CSRRows, num_classes: int, background: bool, grid: PixelGrid = NO_PIXELS,
@@ -97,7 +97,7 @@ class GPUOperator(ViewOperator):
         self, codes: CSRRows | RowTensors, num_classes: int, of: np.ndarray | torch.Tensor | None,
         wanted: np.ndarray | None = None,
     ) -> torch.Tensor:  # fmt: skip
-        """Write codes of `ids` out by class on the GPU, (M, K); `of` as in `blend_rows`. Both may be there already."""
+        """Write codes of `ids` out by class on the GPU, (M, K); `of` as in `strongest`. Both may be there already."""
         self._check_rows(len(codes.indptr) - 1, of, wanted)
         rows = RowTensors.kept(codes, self._device) if isinstance(codes, CSRRows) else codes
         self._check_classes(rows.indices, num_classes)
