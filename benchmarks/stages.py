@@ -19,7 +19,7 @@ from gsseg_core.learn.em.em_learner import EMLearner
 from gsseg_core.learn.vote_learner import VoteLearner
 from gsseg_core.live.session import LiveSession
 from gsseg_core.raster.backends import make_operator
-from gsseg_core.raster.cpu.depth_sort import sort_by_depth
+from gsseg_core.raster.cpu.depth_sort import sort_keys
 from gsseg_core.raster.cpu.projection import project
 from gsseg_core.raster.cpu.tiling import assign
 from gsseg_core.raster.depth import depths
@@ -77,7 +77,7 @@ def _view_stages(scene: GaussianScene, views: list[View], num_classes: int, runs
         mine = codes[observation.ids[observation.rows], observation.classes[observation.labels]]
         rest = np.ones(len(observation.classes), np.float32)
         add("project and sort", lambda c=camera: project(scene, c))
-        add("of this, sort", lambda d=depth: sort_by_depth(d))
+        add("of this, sort", lambda d=depth: sort_keys(d.view(np.uint32)))
         add("bin", lambda p=projected, c=camera: assign(p, c.width, c.height))
         add("blend", operator.transmittance)
         add(f"render {num_classes} classes", lambda o=operator: o.render(codes))

@@ -22,7 +22,7 @@ _KEEPING = threading.Lock()  # while what is kept changes; not in each object, a
 def default_budget(device: str = "cpu") -> int:
     """Bytes of prepared views that are kept in memory where nobody says how many."""
     if device != "cpu":  # Views are all that a GPU is for.
-        return (free_memory_on(device) or MEMORY_BUDGET) // 2
+        return free_memory_on(device) // 2
     free = free_memory()
     return MEMORY_BUDGET if free is None else free // MEMORY_SHARE
 

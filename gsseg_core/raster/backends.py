@@ -72,9 +72,9 @@ def make_operator(scene: GaussianScene, camera: Camera, device: str = "cpu") -> 
     return operator
 
 
-def free_memory_on(device: str) -> int | None:
-    """Tell how many bytes are free on a device for views, None where unknown; raises as `make_operator` does."""
-    return _module_of(device).free_memory_on(device)
+def free_memory_on(device: str) -> int:
+    """Tell how many bytes are free on a GPU for views; raises as `make_operator` does."""
+    return int(_module_of(device).free_memory_on(device))
 
 
 def vote_total(votes: VoteTotal, device: str) -> AbstractContextManager[Any]:

@@ -27,7 +27,6 @@ from gsseg_core.simd import AHEAD, first_bit, prefetch, store_row
 class Records(NamedTuple):
     """The rows of W that belong to one tile, as far as not every ray had ended."""
 
-    rays: np.ndarray  # (16, 16) float32: final transmittance, by block
     weights: np.ndarray  # (R, 16) float32: pixel by pixel of each record's block
     blocks: np.ndarray  # (R,) uint8: block of each record
     ends: np.ndarray  # (E_t,) int32: one past the last record of each entry that was blended
@@ -58,8 +57,10 @@ def corner_of(tiles: Tiles, tile: int) -> tuple[int, int]:
 
 
 @called_by_kernels
-def blocks_with(wanted: np.ndarray, left: int, top: int) -> int:  # (H, W) bool
+def blocks_with(wanted: np.ndarray, left: int, top: int) -> int:  # (H, W) bool, or (0, 0) for all
     """Which blocks of a tile have pixels that are wanted, as bits."""
+    if not wanted.size:
+        return OPEN
     blocks = 0
     for r in range(top, min(top + TILE, wanted.shape[0])):
         for c in range(left, min(left + TILE, wanted.shape[1])):
@@ -122,5 +123,5 @@ def blend_tile(tiles: Tiles, tile: int) -> Records:
                 live &= ~(1 << b)
         ends[e - first] = n
         if not live:
-            return Records(rays, weights, blocks, ends[: e - first + 1])
-    return Records(rays, weights, blocks, ends)
+            return Records(weights, blocks, ends[: e - first + 1])
+    return Records(weights, blocks, ends)

@@ -1,4 +1,4 @@
-"""Sorts uint32 keys, or positive float32 by their bits, in parallel and in the same way on any number of threads."""
+"""Sorts uint32 keys in parallel and in the same way on any number of threads."""
 
 from __future__ import annotations
 
@@ -10,12 +10,6 @@ from gsseg_core.kernels.compiler import kernel
 DIGIT_BITS = (8, 13)  # of a digit: the least for few keys, whose digits must be counted fast, and the most
 PARTS = 4  # parts that are counted and moved beside each other; fixed, so that threads change nothing
 _KEY = 32  # bits of a row, after which its key begins
-
-
-def sort_by_depth(depth: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Order (M,) int32 that sorts depths, (M,) float32 > 0, and the sorted depths; equal ones stay in their order."""
-    order, keys = sort_keys(depth.view(np.uint32))
-    return order, keys.view(np.float32)
 
 
 def sort_keys(keys: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -99,7 +99,7 @@ def strongest(
     for turn in nb.prange(tiles.rows * tiles.columns):
         tile = tile_of_turn(tiles, turn)
         left, top = corner_of(tiles, tile)
-        looked_at = blocks_with(wanted, left, top) if wanted.size else OPEN
+        looked_at = blocks_with(wanted, left, top)
         if not looked_at:
             continue
         best, known = np.zeros((TILE, TILE), np.int32), np.empty((TILE, TILE), np.float32)
@@ -252,7 +252,7 @@ def render_few(tiles: Tiles, codes: np.ndarray, wanted: np.ndarray) -> tuple[np.
         rays, lines = np.empty((TILE, TILE), np.float32), np.empty((2, 2, TILE), np.float32)
         values, corner = np.zeros((TILE, channels, TILE), np.float32), corner_of(tiles, tile)
         left, top, live = open_rays(tiles, tile, rays)
-        live &= blocks_with(wanted, corner[0], corner[1]) if wanted.size else OPEN
+        live &= blocks_with(wanted, corner[0], corner[1])
         ahead = aim_next(table, entries, tiles.start[tile] - 1, last, left, top, lines)
         for e in range(tiles.start[tile], last):
             g = entries[e]

@@ -21,7 +21,7 @@ import numpy as np
 
 from gsseg_core.kernels.compiler import called_by_kernels, kernel
 from gsseg_core.raster.constants import CHUNKS, DILATION, NEAR
-from gsseg_core.raster.cpu.depth_sort import sort_by_depth
+from gsseg_core.raster.cpu.depth_sort import sort_keys
 from gsseg_core.raster.cpu.splat import HEIGHT, LOG_ALPHA_MIN, LOG_OPACITY, SHEAR, WIDTH, X_TURN, Y_REACH, U, V
 from gsseg_core.scene.camera import Camera
 from gsseg_core.scene.gaussian_scene import GaussianScene
@@ -52,6 +52,13 @@ class Projected(NamedTuple):
     ids: np.ndarray  # (M,) int32: index of each in the scene, ascending
     table: np.ndarray  # (M, 8) float32
     order: np.ndarray  # (M,) int32: rows of the table, nearest first
+
+
+def footprints(table: np.ndarray) -> np.ndarray:  # (M, 8) as that of `Projected`
+    """Sum of each Gaussian's alphas over an endless image, opacity * 2 pi sqrt(|S|): (M,), in px."""
+    # |S| = var(x|y) S_yy, and the table has log2(e) / 2 over each of them.
+    area = np.pi / np.log(2.0) / np.sqrt(table[:, WIDTH] * table[:, HEIGHT])
+    return np.asarray(np.exp2(table[:, LOG_OPACITY]) * area)
 
 
 class Pinhole(NamedTuple):
@@ -109,8 +116,8 @@ def project(scene: GaussianScene, camera: Camera) -> Projected:
     found = _project(splats, bounds, Pinhole.of(camera), table, depth, ids)
     begins = np.arange(CHUNKS) * len(bounds) // CHUNKS * BATCH
     table, depth, ids = (joined(part, begins, found) for part in (table, depth, ids))
-    order, depth = sort_by_depth(depth)
-    _break_ties(order, np.flatnonzero(depth[1:] == depth[:-1]), table)
+    order, keys = sort_keys(depth.view(np.uint32))  # Floats above 0 sort as their bits do.
+    _break_ties(order, np.flatnonzero(keys[1:] == keys[:-1]), table)
     return Projected(ids, table, order)
 
 

@@ -16,8 +16,8 @@ from gsseg_core.raster.cpu.entry_votes import pair_votes
 from gsseg_core.raster.cpu.grid_blending import render_grid
 from gsseg_core.raster.cpu.lifting import Lifted
 from gsseg_core.raster.cpu.objects_alone import TileObjects
-from gsseg_core.raster.cpu.projection import joined, project
-from gsseg_core.raster.cpu.splat import HEIGHT, LOG_OPACITY, WIDTH
+from gsseg_core.raster.cpu.projection import footprints, joined, project
+from gsseg_core.raster.cpu.splat import LOG_OPACITY
 from gsseg_core.raster.cpu.tiling import Tiles, assign
 from gsseg_core.raster.objects_alone import ObjectsAlone
 from gsseg_core.raster.observation import LabelWeights, Observation, VoteShares
@@ -44,10 +44,7 @@ class TileOperator(ViewOperator):
 
     def footprints(self) -> np.ndarray:
         """Sum of the alphas of each of `ids` over an endless image, (M,)."""
-        # |S| = var(x|y) S_yy, and the table has log2(e) / 2 over each of them.
-        table = self._tiles.table
-        area = np.pi / np.log(2.0) / np.sqrt(table[:, WIDTH] * table[:, HEIGHT])
-        return np.exp2(table[:, LOG_OPACITY]) * area
+        return footprints(self._tiles.table)
 
     def _objects_alone(self, labels: np.ndarray) -> ObjectsAlone:
         return TileObjects.of(self.ids, self._tiles, labels)

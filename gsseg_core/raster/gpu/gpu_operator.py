@@ -13,7 +13,8 @@ import torch
 
 from gsseg_core.csr_rows import CSRRows
 from gsseg_core.raster.cpu.products import list_weights
-from gsseg_core.raster.cpu.splat import HEIGHT, LOG_OPACITY, WIDTH
+from gsseg_core.raster.cpu.projection import footprints
+from gsseg_core.raster.cpu.splat import LOG_OPACITY
 from gsseg_core.raster.cpu.tiling import Tiles, stride_of
 from gsseg_core.raster.gpu import blending
 from gsseg_core.raster.gpu.device import find_gpu, launch, on_device, to_cpu
@@ -50,19 +51,12 @@ class GPUOperator(ViewOperator):
         return to_cpu(self.tiles.ids)
 
     @property
-    def nbytes(self) -> int:
-        """Memory that it holds on the GPU, in bytes."""
-        return self.tiles.nbytes
-
-    @property
     def _device(self) -> torch.device:
         return self.tiles.table.device
 
     def footprints(self) -> np.ndarray:
-        """Sum of the alphas of each of `ids` over an endless image, (M,) float32."""
-        table = self.tiles.table
-        area = torch.pi / np.log(2.0) / torch.sqrt(table[:, WIDTH] * table[:, HEIGHT])
-        return to_cpu(torch.exp2(table[:, LOG_OPACITY]) * area)
+        """Sum of the alphas of each of `ids` over an endless image, (M,)."""
+        return footprints(to_cpu(self.tiles.table))
 
     def _without(self, hidden: np.ndarray) -> GPUOperator:
         other, table = copy.copy(self), self.tiles.table.clone()
@@ -168,8 +162,8 @@ def view_operator(scene: GaussianScene, camera: Camera, device: str) -> GPUOpera
 @contextmanager
 def vote_total(votes: VoteTotal, device: str) -> Iterator[Any]:
     """Give a total on the GPU that is added to the votes at the end, or the votes themselves if that has no room."""
-    (count, classes), free = votes.shape, free_memory_on(device)
-    if free is not None and 4 * 8 * count * classes > free:
+    count, classes = votes.shape
+    if 4 * 8 * count * classes > free_memory_on(device):
         yield votes
         return
     total = torch.zeros(votes.shape, dtype=torch.int64, device=find_gpu(device))
@@ -181,7 +175,7 @@ def vote_total(votes: VoteTotal, device: str) -> Iterator[Any]:
             votes.add_rows(CSRRows.from_dense(to_cpu(total[first : first + at_once])), first)
 
 
-def free_memory_on(device: str) -> int | None:
+def free_memory_on(device: str) -> int:
     """Bytes that are free on a GPU, or that PyTorch keeps for what comes; of a simulated one, as a small one has."""
     gpu = find_gpu(device)
     if gpu.type != "cuda":
