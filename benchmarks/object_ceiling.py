@@ -57,7 +57,7 @@ def _cover(
         camera = view.camera
         projected = project(alone, camera)
         tiles = assign(projected, camera.width, camera.height)
-        depth = depths(alone, camera)[projected.ids]
+        depth = depths(alone, camera, projected.ids)
         lists = (tiles, depth, limit, first)
         nothing = np.zeros(0, np.int64), np.zeros(0, np.int64), np.zeros(0, np.float32)
         size = _walk(*lists, *nothing)

@@ -49,9 +49,8 @@ def with_depths(scene: GaussianScene, operator: ViewOperator, others: np.ndarray
     return np.concatenate([others, depths(scene, operator.camera, operator.ids)[:, None]], axis=1)
 
 
-def depths(scene: GaussianScene, camera: Camera, ids: np.ndarray | None = None) -> np.ndarray:
-    """Depth of each centre, or of some of them, (M,) float32 in scene units, from a camera; 0 for those behind it."""
-    ids = np.arange(len(scene), dtype=np.int32) if ids is None else ids
+def depths(scene: GaussianScene, camera: Camera, ids: np.ndarray) -> np.ndarray:  # (M,) int32
+    """Depths of some centres, (M,) float32 in scene units, from a camera; 0 for those behind it."""
     return _depths(scene.means, ids, camera.world_to_camera[2].astype(np.float64))
 
 

@@ -96,7 +96,7 @@ def slow_shares(scene: GaussianScene, labels: np.ndarray, views: list[Silhouette
                 need = through / (1 - through + 1e-3) * (view.labels == k)
                 excess = (view.labels != k) & (view.labels >= 0)
                 for i in members:
-                    shows = excess & (depths(scene, camera)[i] <= BEHIND * view.depth)
+                    shows = excess & (depths(scene, camera, np.array([i]))[0] <= BEHIND * view.depth)
                     stay[i] += (alpha[i] * need).sum()
                     go[i] += (alpha[i] * shows).sum()
         kept = np.where(go > 0, np.clip(kept * stay / np.maximum(go, 1e-30), 0.01, 1), kept)

@@ -41,7 +41,11 @@ class Lifted(NamedTuple):
     slot_start: np.ndarray  # (T + 1,) int64: where each tile's sums begin, one for each entry and label of the tile
     reached: np.ndarray  # (E,) uint16: blocks with a label in which the entry has a weight, one bit each
     sums: np.ndarray  # (slot_start[-1],) float32: sum of weights, in px
-    counts: np.ndarray  # (T, 4) int64: entries with such a block, with one that has a weight, these blocks; sums > 0
+    # Of each tile, (T,) int64:
+    seen: np.ndarray  # entries with such a block
+    weighted: np.ndarray  # entries with such a block that has a weight
+    records: np.ndarray  # blocks of these that have a weight
+    positive: np.ndarray  # sums above 0
 
     @classmethod
     def of(cls, tiles: Tiles, mask: np.ndarray, weights: np.ndarray | None = None) -> Lifted:
@@ -56,20 +60,21 @@ class Lifted(NamedTuple):
         position[classes] = np.arange(len(classes))
         labels = labels._replace(present=position[labels.present])
         slot_start = starts(np.diff(tiles.start) * np.diff(labels.start))
-        return cls(classes, areas[:, classes], labels, slot_start, *_lift(tiles, labels, slot_start))
+        reached, sums, counts = _lift(tiles, labels, slot_start)
+        return cls(classes, areas[:, classes], labels, slot_start, reached, sums, *counts)
 
     def room_for_pairs(self, tiles: Tiles) -> np.ndarray:
         """Where the (Gaussian, label) pairs of each chunk of Gaussians may begin, (CHUNKS + 1,): with room for all."""
         # A chunk has at most one pair for each sum above zero: one for each of its entries, and `extra` more if all
         # entries that have several are in this chunk; and kernels look at the place after its last.
-        extra = self.counts[:, 3].sum() - self.counts[:, 0].sum() + 1
+        extra = self.positive.sum() - self.seen.sum() + 1
         chunks, count = np.arange(CHUNKS + 1), len(tiles.gaussian_start) - 1
         return np.asarray(tiles.gaussian_start[chunks * count // CHUNKS] + extra * chunks)
 
     @property
     def sees(self) -> bool:
         """Whether a labelled pixel sees any Gaussian."""
-        return bool(self.counts[:, 0].any())
+        return bool(self.seen.any())
 
 
 @kernel
@@ -130,15 +135,15 @@ def _is_uniform(mask: np.ndarray, left: int, top: int) -> bool:
 
 @kernel(parallel=True, fastmath=FAST, error_model="numpy")
 def _lift(tiles: Tiles, labels: Labels, slot_start: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Blend the view, and sum weights by entry and label: the last three attributes of `Lifted`."""
+    """Blend the view, and sum weights by entry and label: the last attributes of `Lifted`, what is of tiles (4, T)."""
     reached, sums = np.empty(len(tiles.entries), np.uint16), np.empty(slot_start[-1], np.float32)
-    counts = np.empty((len(slot_start) - 1, 4), np.int64)
+    counts = np.empty((4, len(slot_start) - 1), np.int64)
     for turn in nb.prange(tiles.rows * tiles.columns):
         tile = tile_of_turn(tiles, turn)
         label_count = labels.start[tile + 1] - labels.start[tile]
         blocks = reached[tiles.start[tile] : tiles.start[tile + 1]]
         blocks[:] = 0
-        with_block = with_weight = num_blocks = positive = 0
+        seen = with_weight = records = positive = 0
         weighted = weighted_blocks(labels.weights[tile])
         if label_count:
             own = sums[slot_start[tile] : slot_start[tile + 1]]
@@ -148,13 +153,12 @@ def _lift(tiles: Tiles, labels: Labels, slot_start: np.ndarray) -> tuple[np.ndar
             else:
                 _lift_tile(tiles, labels, tile, blocks, own, label_count)
             for e in range(len(blocks)):
-                with_block += blocks[e] > 0
+                seen += blocks[e] > 0
                 with_weight += (blocks[e] & weighted) > 0
-                num_blocks += count_bits(blocks[e] & weighted)
+                records += count_bits(blocks[e] & weighted)
             for i in range(len(own)):
                 positive += own[i] > 0
-        of_tile = counts[tile]
-        of_tile[0], of_tile[1], of_tile[2], of_tile[3] = with_block, with_weight, num_blocks, positive
+        counts[0, tile], counts[1, tile], counts[2, tile], counts[3, tile] = seen, with_weight, records, positive
     return reached, sums, counts
 
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import numba as nb
 import numpy as np
 
@@ -15,15 +17,15 @@ from gsseg_core.scene.camera import Camera
 from gsseg_core.scene.gaussian_scene import GaussianScene
 from gsseg_core.simd import FAST, first_bit
 
+_GOES_ON, _NO_LABEL = -1, -2  # in place of the entry at which a tile's rays end
+
 
 def nearest_depths(scene: GaussianScene, camera: Camera) -> np.ndarray:
     """Find how near Gaussians come in each tile of a view: (T,) float32, in scene units, infinite where none is.
 
     T is the number of 16 x 16 tiles, row by row.
     """
-    projected = project(scene, camera)
-    tiles = assign(projected, camera.width, camera.height)
-    return _entry_depths(scene, camera, projected.ids, tiles, tiles.start[:-1], np.diff(tiles.start) > 0)
+    return _entry_depths(scene, camera, lambda tiles: np.where(np.diff(tiles.start), tiles.start[:-1], _GOES_ON))
 
 
 def ray_ends(
@@ -36,23 +38,16 @@ def ray_ends(
     What lies beyond has no weight in any of them, and lifting never comes to it. Infinite where a ray goes on;
     -infinite where no pixel has a label.
     """
+    return _entry_depths(scene, camera, lambda tiles: _find_ends(tiles, np.greater_equal(labels, 0, order="C")))
+
+
+def _entry_depths(scene: GaussianScene, camera: Camera, find: Callable[[Tiles], np.ndarray]) -> np.ndarray:
+    """Depths of the entry that is found of each tile, (T,) float32; infinite where there is none."""
     projected = project(scene, camera)
     tiles = assign(projected, camera.width, camera.height)
-    ends = _find_ends(tiles, np.greater_equal(labels, 0, order="C"))
-    found = _entry_depths(scene, camera, projected.ids, tiles, ends, ends >= 0)
-    found[ends == _NO_LABEL] = -np.inf
-    return found
-
-
-_GOES_ON, _NO_LABEL = -1, -2
-
-
-def _entry_depths(
-    scene: GaussianScene, camera: Camera, ids: np.ndarray, tiles: Tiles, entries: np.ndarray, valid: np.ndarray
-) -> np.ndarray:
-    """Depths of an entry of each tile, (T,) float32, where that is valid; else infinite."""
-    found = np.full(len(valid), np.inf, np.float32)
-    found[valid] = depths(scene, camera, ids[tiles.entries[entries[valid]]])
+    entries = find(tiles)
+    found = np.where(entries == _NO_LABEL, np.float32(-np.inf), np.float32(np.inf))
+    found[entries >= 0] = depths(scene, camera, projected.ids[tiles.entries[entries[entries >= 0]]])
     return found
 
 

@@ -1,6 +1,6 @@
 """Products with the weight matrix W of one view, tile by tile.
 
-They are W q, W^T r, and both restricted to the pixels' own labels.
+They are W q and W^T r; and W is listed.
 """
 
 from __future__ import annotations

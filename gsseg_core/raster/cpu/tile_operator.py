@@ -138,9 +138,9 @@ class TileObservation(Observation):
     def __init__(self, name: str, ids: np.ndarray, tiles: Tiles, lifted: Lifted) -> None:  # ids (M,)
         self.name, self.classes, self._mask = name, lifted.classes, lifted.labels
         self.areas, self.weighted_areas = lifted.areas[0].astype(np.int64), lifted.areas[1]
-        label_count, counts = np.diff(self._mask.start), lifted.counts
-        start, shared_start, self._slot_start = map(starts, (counts[:, 0], counts[:, 1], counts[:, 1] * label_count))
-        self._records = counts[:, 2].copy()
+        label_count, self._records = np.diff(self._mask.start), lifted.records.copy()
+        start, shared_start = starts(lifted.seen), starts(lifted.weighted)
+        self._slot_start = starts(lifted.weighted * label_count)
         kept, shared, self._blocks = label_pairs.keep_entries(
             tiles.start, lifted.reached, start, shared_start, self._mask.weights
         )

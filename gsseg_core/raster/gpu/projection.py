@@ -61,13 +61,9 @@ _KNOWN: dict[torch.device, PerScene[SceneTensors]] = {}
 
 def tensors_of(scene: GaussianScene, device: torch.device) -> SceneTensors:
     """Copy a scene to a device, once: its tensors are kept as long as it."""
-
-    def copied() -> SceneTensors:
-        return SceneTensors(
-            *(on_device(array, device) for array in (scene.means, scene.quats, scene.scales, scene.log_opacities))
-        )
-
-    return _KNOWN.setdefault(device, PerScene()).of(scene, copied)
+    arrays = (getattr(scene, name) for name in SceneTensors._fields)
+    known = _KNOWN.setdefault(device, PerScene())
+    return known.of(scene, lambda: SceneTensors(*(on_device(array, device) for array in arrays)))
 
 
 def project(scene: GaussianScene, camera: Camera, device: torch.device) -> TileTensors:
