@@ -12,7 +12,6 @@ import pytest
 from small_scenes import NAMES, balls_on_a_table, clean_views
 
 from gsseg_core.cli.main import main
-from gsseg_core.data.soft_masks import SeenLabels
 from gsseg_core.data.view import View
 from gsseg_core.errors import StateFileError
 from gsseg_core.learn.learner_state import State
@@ -21,7 +20,6 @@ from gsseg_core.live import living_session
 from gsseg_core.live.living_session import LivingSession
 from gsseg_core.live.living_votes import LivingVotes, without_views
 from gsseg_core.live.per_view_session import PerViewSession
-from gsseg_core.raster.view_operator import ViewOperator
 from gsseg_core.raster.vote_total import VoteTotal
 from gsseg_core.scene.gaussian_scene import GaussianScene
 from gsseg_core.scene.scene_delta import GroupMove, SceneDelta
@@ -223,11 +221,9 @@ def test_where_all_but_a_few_views_of_a_state_are_known_only_those_are_lifted(
     session, lifted = load(states[2]), list[tuple[str, int]]()
     lift = LivingVotes._lift
 
-    def counted(
-        votes: LivingVotes, view: View, seen: SeenLabels, sign: int, operator: ViewOperator | None = None
-    ) -> bool:
+    def counted(votes: LivingVotes, view: View, sign: int) -> bool:
         lifted.append((view.name, sign))
-        return lift(votes, view, seen, sign, operator)
+        return lift(votes, view, sign)
 
     monkeypatch.setattr(LivingVotes, "_lift", counted)
     session.merge([states[3]])
