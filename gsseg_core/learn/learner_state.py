@@ -18,12 +18,11 @@ from typing import Any
 import numpy as np
 
 from gsseg_core.csr_rows import CSRRows, starts
-from gsseg_core.data.class_names import check_same_names
 from gsseg_core.data.label_evidence import UNITS, LabelEvidence
 from gsseg_core.data.label_images import DIGEST_BYTES, PER_VIEW, UNKNOWN
 from gsseg_core.data.soft_masks import TOLERANCE, SeenLabels
 from gsseg_core.data.view import View
-from gsseg_core.errors import GssegError, StateFileError
+from gsseg_core.errors import GssegError
 from gsseg_core.files.atomic import check_replaceable, write_atomically
 from gsseg_core.files.input_files import UnfitError
 from gsseg_core.files.json_files import whole_number
@@ -97,10 +96,6 @@ class State:
     def all_known(self) -> bool:
         """Whether all views in the votes are kept or among the `dropped`; an older version did not list these."""
         return self.num_fused == len(self.views) + len(self.dropped)
-
-    def check_names(self, known: Mapping[int, str], source: str | os.PathLike[str], where: str) -> None:
-        """Raise `StateFileError` if this state, of `source`, calls a class otherwise than it is called elsewhere."""
-        check_same_names(self.class_names, known, source, where, StateFileError)
 
     def save(self, path: str | os.PathLike[str], digest: str) -> None:
         """Write the state of the scene with this digest, atomically (`WriteError`); colours are not in the file.

@@ -2,16 +2,15 @@
 
 from __future__ import annotations
 
-import itertools
 from collections import Counter
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
 
 from gsseg_core.csr_rows import CSRRows
-from gsseg_core.data.class_names import names_together
+from gsseg_core.data.class_names import check_same_names, names_together
 from gsseg_core.data.view import View
 from gsseg_core.errors import StateFileError, StateMismatchError
 from gsseg_core.learn.learner_state import OBJECTS_OF_ONE_SESSION, State
@@ -58,7 +57,10 @@ def merge_states(
         votes, num_fused = votes.plus(state.votes), num_fused + state.num_fused
         dropped += state.dropped
         for view in state.views:
-            name = next(free for free in _names(view.name) if free not in views)
+            name, count = view.name, 1
+            while name in views:
+                count += 1
+                name = f"{view.name}_{count}"
             views[name] = view if name == view.name else _renamed(view, name)
     num_classes = max(one.state.num_classes for one in saved)
     # One state alone stays of its kind.
@@ -86,19 +88,13 @@ def _check_fits(saved: Sequence[Saved], number: int, names: Mapping[int, str]) -
         raise StateFileError(
             f"{one.source}: {OBJECTS_OF_ONE_SESSION}; expected classes whose ids mean the same in all states"
         )
-    one.state.check_names(names, one.source, "the states before it")
+    check_same_names(one.state.class_names, names, one.source, "the states before it", StateFileError)
     for other in saved[:number]:
         if _brings_nothing(one.state, other.state):
             raise StateFileError(
                 f"{one.source}: {other.source} has all its votes and views already, which would count twice; "
                 "expected each state once"
             )
-
-
-def _names(name: str) -> Iterator[str]:
-    """Give the names that views of one name get, one after the other."""
-    yield name
-    yield from (f"{name}_{count}" for count in itertools.count(2))
 
 
 def _renamed(view: View, name: str) -> View:

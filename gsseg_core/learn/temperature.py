@@ -53,7 +53,6 @@ def tempered(
     array is returned; else no entry is above 1. Going to a temperature and then to its reciprocal leads back, up to
     rounding and to entries that are too small for the type. Raises `SettingsError` for what is no temperature.
     """
-    _check(temperature)
     if temperature == 1:
         return shares
     rows = CSRRows.from_dense(shares.reshape(-1, shares.shape[-1]).astype(np.float32, copy=False))
@@ -62,13 +61,9 @@ def tempered(
 
 def tempered_rows(shares: CSRRows, temperature: float) -> CSRRows:
     """Do with sparse shares, float32, what `tempered` does; zeros take neither memory nor time."""
-    _check(temperature)
-    return shares if temperature == 1 else shares.with_data(_powers(shares, np.float32(temperature)))
-
-
-def _check(temperature: float) -> None:
     if not _SMALLEST < temperature < 1 / _SMALLEST:
         raise SettingsError(f"temperature is {temperature}; expected a number above 0 that float32 can hold")
+    return shares if temperature == 1 else shares.with_data(_powers(shares, np.float32(temperature)))
 
 
 @kernel(parallel=True)

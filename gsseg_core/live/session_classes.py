@@ -64,7 +64,7 @@ class SessionClasses:
         if state.num_classes > most:
             raise StateFileError(f"{path}: holds {state.num_classes} classes; expected at most {most}{why}")
         if self.declared:
-            state.check_names(self.names, path, "the names that were given")
+            check_same_names(state.class_names, self.names, path, "the names that were given", StateFileError)
 
     def check_label(self, label: int, votes: Learner, found: str, remedy: str) -> None:
         """Raise `UnknownLabelError` where there may be no such class: what was `found`, what is expected, a remedy."""
