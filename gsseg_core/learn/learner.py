@@ -89,6 +89,7 @@ class Learner(ABC):
     code_rows_: CSRRows
     observed_: np.ndarray
     converged_: bool = False
+    dropped: tuple[bytes, ...] = ()  # `View.digest` of views whose votes stay; replaced and never changed
     leaves_out = False
     checks_masks = False
 
@@ -233,7 +234,8 @@ class Learner(ABC):
 
     def state(self) -> State:
         """Return a copy of votes and views, to be saved."""
-        return State(self._votes.rows(), self.num_classes, list(self.views.values()), len(self.views))
+        views = list(self.views.values())
+        return State(self._votes.rows(), self.num_classes, views, len(views), dropped=self.dropped)
 
     def adopt(self, state: State) -> None:
         """Replace views, votes and number of classes by a state's, of the same scene; votes of old are cast anew.
@@ -245,7 +247,7 @@ class Learner(ABC):
         votes = VoteTotal.from_rows(state.votes, state.num_classes, along_curve(self.scene))
         self._unfit()
         self.views, self._votes = {view.name: view for view in state.views}, votes
-        self.num_classes = state.num_classes
+        self.num_classes, self.dropped = state.num_classes, state.dropped
         self.rejected.clear()
         self._prepared.clear()
         if state.whole_rays:
@@ -301,11 +303,8 @@ class Learner(ABC):
 
     def _lift(
         self, view: View, sign: int, operator: ViewOperator | None = None, seen: SeenLabels | None = None
-    ) -> bool:  # fmt: skip
-        """Add a view's votes, or take them away, and keep nothing of it; tell whether it sees any Gaussian.
-
-        Its operator is made, and its mask is read, unless they are at hand.
-        """
+    ) -> bool:
+        """Add a view's votes, or take them away, and keep nothing of it; tell whether it sees any Gaussian."""
         operator = operator or self._operator_of(view)
         used = self._used_labels(seen or read_mask(view, self.num_classes), operator)
         return operator.vote(used.labels, used.evidence, self._votes, sign=sign)

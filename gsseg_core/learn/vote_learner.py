@@ -10,7 +10,6 @@ import numpy as np
 from gsseg_core.data.view import View
 from gsseg_core.learn.all_or_nothing import Undo, all_or_nothing, checkpoint
 from gsseg_core.learn.learner import Learner, Progress, silent
-from gsseg_core.learn.learner_state import State
 from gsseg_core.raster.view_operator import ViewOperator
 from gsseg_core.scene.camera import Camera
 
@@ -22,16 +21,6 @@ class VoteLearner(Learner):
     """
 
     leaves_out = True
-    dropped: tuple[bytes, ...] = ()  # `View.digest` of views whose votes stay; replaced and never changed
-
-    def state(self) -> State:
-        """Return a copy of votes and views, to be saved."""
-        return replace(super().state(), dropped=self.dropped)
-
-    def adopt(self, state: State) -> None:
-        """Replace all that is known by a state's, as `Learner.adopt` does."""
-        super().adopt(state)
-        self.dropped = state.dropped
 
     def fit(self, progress: Progress = silent) -> VoteLearner:
         """Normalise the votes."""
