@@ -97,20 +97,20 @@ class PerViewSession(LiveSession):
             if views:  # All at once: if there is no room for all, there are no more classes than before.
                 whole.enter_context(all_or_nothing(self._live.checkpoint()))
                 self._grow_for(max(views.values(), key=lambda view: view.largest_label))
-            self._relabel(views, repair.successors if moved and forgotten else None)
+            if moved and forgotten:
+                self._relabel_all(views, repair.successors)
+            else:
+                for view in views.values():
+                    self._live.relabel(view)
             if moved:
                 self._repairs.append(repair.successors)
             self._learnt = learnt
             self._version += 1
         return repair
 
-    def _relabel(self, views: Mapping[str, View], successors: np.ndarray | None) -> None:
-        """Put views in the places of those of their names; with successors, other votes go along with their objects."""
+    def _relabel_all(self, views: Mapping[str, View], successors: np.ndarray) -> None:
+        """Put views in the places of those of their names, and move all other votes to the successors of objects."""
         every = list(self._live.views)
-        if successors is None:
-            for view in views.values():
-                self._live.relabel(view)
-            return
         # What is left once the views have gone is of those that are no longer kept.
         for name in views:
             self._live.retract(name)
