@@ -36,7 +36,7 @@ from gsseg_core.export.view_pictures import draw_worst_views
 from gsseg_core.files.atomic import write_atomically
 from gsseg_core.learn.em.em_learner import EMLearner, EMSettings
 from gsseg_core.learn.learner import Learner
-from gsseg_core.learn.mask_reliability import check_views
+from gsseg_core.learn.mask_reliability import MaskChecker
 from gsseg_core.learn.registry import make_learner
 from gsseg_core.report.pictures import ViewImages
 from gsseg_core.scene.gaussian_scene import GaussianScene
@@ -268,7 +268,7 @@ def measure_reliability(benches: Sequence[Bench], pictures: Path, aside: Path) -
         views = with_bad_frames(bench, 0)
         learner = taught(EM, bench, views)
         assert isinstance(learner, EMLearner)
-        checks = check_views(learner)
+        checks = MaskChecker(learner).check_all()
         told = np.array([check.reliability for check in checks])
         true = np.array(right_share(views, bench.train))
         many = round(BAD_SHARE * len(views))

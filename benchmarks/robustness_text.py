@@ -51,7 +51,7 @@ Learnt from {views} views, scored on {tests}. Empty: not measured, since the gra
 
 RELIABILITY = """## Which masks to trust
 
-A view's *reliability* is the share of its pixels whose label the other views predict: `check_views` takes one step of
+A view's *reliability* is the share of its pixels whose label the other views predict: `MaskChecker` takes one step of
 EM from the learnt probabilities, without the summand of this view. Here every view has errors of random strength, up to
 those above, and a fifth of the views is bad: ids exchanged by half of the objects or more, all ids passed on, half of
 the objects missed or more, or the mask 30 to 60 px, times a random share, beside its image.

@@ -185,11 +185,6 @@ def _compared(labels: np.ndarray) -> np.ndarray:  # (H, W)
     return wanted
 
 
-def check_views(learner: Learner, progress: Progress = silent) -> list[ViewCheck]:
-    """Compare each view's mask with what the other views predict, in the order of the views; see `MaskChecker`."""
-    return MaskChecker(learner).check_all(progress)
-
-
 def worst_views(checks: Iterable[ViewCheck], count: int | None = None) -> list[ViewCheck]:
     """Sort views by reliability, the worst first; those that nothing is known of come last. All, or so many at most."""
     return sorted(checks, key=lambda check: (not check.checked, check.reliability))[:count]

@@ -12,7 +12,7 @@ from small_scenes import NUM_CLASSES, balls_on_a_table, clean_views, ring, taugh
 
 from gsseg_core import pipeline
 from gsseg_core.learn.em.em_learner import EMLearner
-from gsseg_core.learn.mask_reliability import check_views
+from gsseg_core.learn.mask_reliability import MaskChecker
 from gsseg_core.report.findings import MaskChecks
 from gsseg_core.segmentation import Segmentation
 
@@ -43,7 +43,7 @@ def segmented() -> tuple[Segmentation, MaskChecks]:
     learner = EMLearner(scene, NUM_CLASSES)
     taught(learner, views).fit()
     result = Segmentation.from_codes(scene, learner.codes_, {k: f"class {k}" for k in range(NUM_CLASSES)})
-    return result, MaskChecks(check_views(learner), {view.name: view for view in views}, held_out=True)
+    return result, MaskChecks(MaskChecker(learner).check_all(), {view.name: view for view in views}, held_out=True)
 
 
 def minimal_report(**changes: Any) -> dict[str, Any]:

@@ -23,7 +23,7 @@ from gsseg_core.learn.em import em_learner, spatial_prior
 from gsseg_core.learn.em.em_learner import EMLearner, EMSettings
 from gsseg_core.learn.gradient_learner import GradientLearner
 from gsseg_core.learn.learner import Learner
-from gsseg_core.learn.mask_reliability import check_views
+from gsseg_core.learn.mask_reliability import MaskChecker
 from gsseg_core.learn.vote_learner import VoteLearner
 from gsseg_core.raster.backends import make_operator
 from gsseg_core.refine.settings import UNREFINED, RefineSettings
@@ -168,7 +168,7 @@ def test_views_that_are_worked_on_several_at_once_give_the_same_results(
     assert list(together.views) == list(alone.views) and together.rejected == alone.rejected != {}
     np.testing.assert_array_equal(together.fit().codes_, alone.fit().codes_)
     assert list(together.error_models_) == list(alone.error_models_) and together.history_ == alone.history_
-    for one, other in zip(check_views(together), check_views(alone), strict=True):
+    for one, other in zip(MaskChecker(together).check_all(), MaskChecker(alone).check_all(), strict=True):
         assert one.name == other.name
         for counts in zip(one.counts, other.counts, strict=True):
             np.testing.assert_array_equal(*counts)
@@ -280,8 +280,8 @@ def test_what_was_fitted_to_views_or_classes_that_are_gone_predicts_nothing(kind
     for learner in (another, fewer):
         assert not hasattr(learner, "codes_") and learner.history_ == []
         with pytest.raises(SettingsError, match=r"view 'view0' was not learnt from; expected .* fit\(\)"):
-            check_views(learner)
-        assert min(check.reliability for check in check_views(learner.fit())) > 0.9
+            MaskChecker(learner).check_all()
+        assert min(check.reliability for check in MaskChecker(learner.fit()).check_all()) > 0.9
 
 
 @pytest.mark.parametrize("budget", [0, 1 << 30])

@@ -21,7 +21,7 @@ from gsseg_core.learn.em.em_learner import EMLearner
 from gsseg_core.learn.gradient_learner import GradientLearner
 from gsseg_core.learn.learner import Learner
 from gsseg_core.learn.learner_state import State
-from gsseg_core.learn.mask_reliability import check_views
+from gsseg_core.learn.mask_reliability import MaskChecker
 from gsseg_core.learn.vote_learner import VoteLearner
 from gsseg_core.raster.cpu import label_pairs
 from gsseg_core.raster.observation import Observation
@@ -83,7 +83,7 @@ def test_nothing_is_asked_twice_of_a_view_that_is_in_the_file(monkeypatch: pytes
         asked.clear()
         learner = taught(EMLearner(SCENE, NUM_CLASSES, memory_budget=budget), VIEWS).fit()
         after_fit = len(asked)
-        check_views(learner)
+        MaskChecker(learner).check_all()
         counts.append((after_fit, len(asked)))
     assert counts[0] == counts[1] and counts[0][0] == counts[0][1]
     learner.retract(VIEWS[0].name)

@@ -20,7 +20,7 @@ from gsseg_core.errors import MaskFormatError
 from gsseg_core.export.view_pictures import draw_worst_views
 from gsseg_core.learn import mask_reliability
 from gsseg_core.learn.em.em_learner import EMLearner
-from gsseg_core.learn.mask_reliability import ViewCheck, check_views, compare_mask, reliability_report, worst_views
+from gsseg_core.learn.mask_reliability import MaskChecker, ViewCheck, compare_mask, reliability_report, worst_views
 from gsseg_core.learn.temperature import grid_of
 from gsseg_core.report.pictures import ViewImages
 from gsseg_core.text import percent
@@ -41,7 +41,7 @@ def learner_with_bad_frames() -> EMLearner:
 
 @cache
 def checks() -> dict[str, ViewCheck]:
-    return {check.name: check for check in check_views(learner_with_bad_frames())}
+    return {check.name: check for check in MaskChecker(learner_with_bad_frames()).check_all()}
 
 
 def test_bad_frames_come_first() -> None:
@@ -99,7 +99,7 @@ def test_a_share_of_a_few_pixels_is_not_said_to_be_nothing() -> None:
 def test_a_view_is_held_against_the_others_only() -> None:
     learner = EMLearner(SCENE, NUM_CLASSES)
     taught(learner, CLEAN[:1]).fit()
-    alone = check_views(learner)[0]
+    alone = MaskChecker(learner).check_all()[0]
     truth = CLEAN[0].read_labels()
     # Nobody else has seen what it shows, so only the empty rays, which belong to the background, say anything.
     assert alone.checked < truth.size and not alone.counts.sums()[1:].any()
@@ -146,14 +146,14 @@ def test_unknown_pixels_do_not_count() -> None:
     labels[:20] = UNKNOWN
     learner = EMLearner(SCENE, NUM_CLASSES)
     taught(learner, [View.from_arrays(CLEAN[0].camera, labels), *CLEAN[1:]]).fit()
-    check = check_views(learner)[0]
+    check = MaskChecker(learner).check_all()[0]
     assert check.num_pixels == check.checked == (labels >= 0).sum()
 
 
 def test_of_large_views_a_third_is_compared_which_tells_the_same(monkeypatch: pytest.MonkeyPatch) -> None:
     every = checks()
     monkeypatch.setattr(mask_reliability, "_LARGE", 100)
-    for third in check_views(learner_with_bad_frames()):
+    for third in MaskChecker(learner_with_bad_frames()).check_all():
         whole = every[third.name]
         assert third.num_pixels == whole.num_pixels and third.checked == pytest.approx(whole.checked / 3, rel=0.1)
         assert third.reliability == pytest.approx(whole.reliability, abs=0.05)  # Of views of 3,072 px.
@@ -182,7 +182,7 @@ def test_views_of_which_nothing_is_known_come_last_and_have_no_figure() -> None:
 def test_every_view_is_told_of_and_nothing_that_was_learnt_changes() -> None:
     learner = learner_with_bad_frames()
     codes, told = learner.codes_.copy(), []
-    check_views(learner, lambda stage, done, total: told.append((stage, done, total)))
+    MaskChecker(learner).check_all(lambda stage, done, total: told.append((stage, done, total)))
     np.testing.assert_array_equal(learner.codes_, codes)
     assert told == [("check views", done, 12) for done in range(13)]
 
@@ -197,7 +197,7 @@ def test_a_check_tells_which_classes_the_border_cuts() -> None:
 
 
 def test_the_same_views_give_the_same_figures() -> None:
-    again = check_views(learner_with_bad_frames())
+    again = MaskChecker(learner_with_bad_frames()).check_all()
     for check in again:
         for one, other in zip(check.counts, checks()[check.name].counts, strict=True):
             np.testing.assert_array_equal(one, other)

@@ -24,7 +24,7 @@ from gsseg_core.data.dataset import Dataset
 from gsseg_core.data.label_images import write_mask
 from gsseg_core.data.view import View
 from gsseg_core.learn.em.em_learner import EMLearner
-from gsseg_core.learn.mask_reliability import ViewCheck, check_views
+from gsseg_core.learn.mask_reliability import MaskChecker, ViewCheck
 from gsseg_core.learn.renamed_ids import renamed_ids, renamed_report
 from gsseg_core.live.session import LiveSession
 
@@ -42,7 +42,7 @@ def renamed_in(session: LiveSession) -> list[dict[str, str]]:
 
 
 def found_in(views: list[View]) -> dict[int, int]:
-    return renamed_ids(check_views(taught(EMLearner(balls_on_a_table()[0], 2 * NUM_CLASSES), views).fit()))
+    return renamed_ids(MaskChecker(taught(EMLearner(balls_on_a_table()[0], 2 * NUM_CLASSES), views).fit()).check_all())
 
 
 def test_objects_that_a_tracker_lost_half_way_have_two_ids_and_are_found_by_one_at_least() -> None:

@@ -30,7 +30,7 @@ from gsseg_core.data.view import View
 from gsseg_core.errors import UnknownLabelError
 from gsseg_core.learn.em.em_learner import EMLearner, EMSettings
 from gsseg_core.learn.learner import Learner
-from gsseg_core.learn.mask_reliability import check_views
+from gsseg_core.learn.mask_reliability import MaskChecker
 from gsseg_core.learn.registry import LEARNERS, make_learner
 from gsseg_core.learn.vote_learner import VoteLearner
 from gsseg_core.learn.vote_resolution import impute_probabilities, is_resolved, resolved_votes, vote_shares, weigh_votes
@@ -287,7 +287,8 @@ def test_reliability_of_a_partial_mask_counts_only_what_it_says() -> None:
     labels = views[1].read_labels()
     wrong = np.where(labels == 1, 2, np.where(labels == 2, 1, 0))
     views[1] = View.from_arrays(views[1].camera, wrong, supervised=[1, 2])
-    checks = {check.name: check for check in check_views(taught(EMLearner(SCENE, NUM_CLASSES), views).fit())}
+    learner = taught(EMLearner(SCENE, NUM_CLASSES), views).fit()
+    checks = {check.name: check for check in MaskChecker(learner).check_all()}
     assert all(check.reliability > 0.95 for name, check in checks.items() if name != "view1")
     assert checks["view1"].reliability < min(c.reliability for n, c in checks.items() if n != "view1") - 0.02
     called = checks["view3"].counts.dense(len(checks["view3"].classes))[3]
