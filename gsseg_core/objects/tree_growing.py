@@ -74,8 +74,9 @@ def grow_tree(
     for k in range(1, num_classes):
         rows = weights[members[k]]
         used = np.unique(rows.indices)
-        rows, own = rows[:, used], segments.among(used)
-        merged = _regions(means[members[k]], rows, own)
+        rows, own, seen = rows[:, used], segments.among(used), np.diff(rows.indptr) > 0
+        cell = cells(means[members[k]][seen], max(float(_CELL), np.count_nonzero(seen) / _MOST_CELLS))
+        merged = own.merged(rows[seen], cell)
         tops = _kept(merged, own.showing(merged))
         found = _stepped(tops[0] if len(tops) == 1 else _Region(0.0, tops), level, 1.0)
         if found.parts:
@@ -127,12 +128,6 @@ def _stacked(views: Mapping[str, Lifted], num_gaussians: int) -> tuple[sparse.cs
     view = np.repeat(np.arange(len(blocks)), [block.shape[0] for block in blocks])
     every = _Segments(view, sums(stacked, 1))
     return stacked.T.tocsr(), every.among(np.arange(len(view)))
-
-
-def _regions(means: np.ndarray, rows: sparse.csr_matrix, segments: _Segments) -> Merged:
-    """Merge the cells of an object."""
-    seen = np.flatnonzero(np.diff(rows.indptr))
-    return segments.merged(rows[seen], cells(means[seen], max(float(_CELL), len(seen) / _MOST_CELLS)))
 
 
 def _kept(merged: Merged, shown: np.ndarray, objects: Sequence[_Region] = ()) -> list[_Region]:
