@@ -19,7 +19,7 @@ from gsseg_core.data.mask_files import mask_files, masks_below
 from gsseg_core.data.mask_formats.place import SUPERVISES
 from gsseg_core.data.mask_formats.table import open_masks
 from gsseg_core.errors import GssegError
-from gsseg_core.files.input_files import READABLE_IMAGES
+from gsseg_core.files.input_files import READABLE_IMAGES, list_folder
 
 # Camera files of other programs, and how one gets from each to one that is read.
 _FOREIGN_CAMERAS = {
@@ -68,8 +68,8 @@ def camera_hint(folder: Path) -> str:
     for name, advice in _FOREIGN_CAMERAS.items():
         if (folder / name).is_file():
             return f"; found {name}: {advice}"
-    with suppress(OSError):
-        names = sorted(path.name + "/" * path.is_dir() for path in folder.iterdir() if not path.name.startswith("."))
+    with suppress(GssegError):
+        names = [path.name + "/" * os.path.isdir(path) for path in list_folder(folder, GssegError, None)]
         return f"; found {', '.join(names[:8])}{' ...' if len(names) > 8 else ''}" if names else "; the folder is empty"
     return ""
 
@@ -91,8 +91,8 @@ def mask_hint(root: Path, labels: str, stems: Collection[str]) -> str:
         return f"{looked}, but {labels} is a link to {os.readlink(folder)}, which does not exist"
     if not folder.is_dir():
         return f"{looked}, but {_seen_instead(root, labels, stems, expected)}"
-    there = sorted(path for path in folder.iterdir() if path.name != SUPERVISES)
-    there = [path for path in there if path.suffix.lower() in _MASKS or _has_detections(path)]
+    there = [path for path in _entries(folder) if path.suffix.lower() in _MASKS or _has_detections(path)]
+    there = [path for path in there if path.name != SUPERVISES]
     if not there:
         return f"{looked}, but {labels}/ holds no mask"
     if there[0].is_file() and there[0].suffix.lower() not in (".png", ".npz"):
@@ -125,7 +125,7 @@ def _seen_instead(root: Path, labels: str, stems: Collection[str], expected: str
     """Say that there is no folder of masks, and what the folders are whose files have the cameras' names."""
     folders = [path for path in _folders(root) if _stems(path) & set(stems)]
     if folder := next((path for path in folders if _OF_MASKS.search(path.name)), None):
-        name = min(path.name for path in folder.iterdir() if path.stem in stems)
+        name = next(path.name for path in _entries(folder) if path.stem in stems)
         return f"{folder.relative_to(root)}/ holds files such as {name}; expected {expected}"
     hint = f" ({folders[0].name}/ holds photos; a 2D segmenter makes masks of them)" if folders else ""
     return f"there is no folder {labels}/{hint}"
@@ -159,16 +159,19 @@ def _folders(root: Path) -> list[Path]:
     return found[:_MOST_FOLDERS]
 
 
-def _subfolders(folder: Path) -> list[Path]:
-    with suppress(OSError):
-        return sorted(path for path in folder.iterdir() if path.is_dir() and not path.name.startswith("."))
+def _entries(folder: Path) -> list[Path]:
+    """List what is in a folder and not hidden, sorted; nothing where one may not look."""
+    with suppress(GssegError):
+        return list_folder(folder, GssegError, None)
     return []
 
 
+def _subfolders(folder: Path) -> list[Path]:
+    return [path for path in _entries(folder) if os.path.isdir(path)]
+
+
 def _stems(folder: Path) -> set[str]:
-    with suppress(OSError):
-        return {path.stem for path in folder.iterdir() if path.suffix.lower() in _MASKS}
-    return set()
+    return {path.stem for path in _entries(folder) if path.suffix.lower() in _MASKS}
 
 
 def _masks(finder: Callable[..., dict[str, Path]], folder: Path, stems: Collection[str]) -> list[Path]:
@@ -192,9 +195,7 @@ def _count_foreign(place: Path, stems: Collection[str], depth: int) -> int:
 
 def _annotations(root: Path) -> list[Path]:
     """List the files in a folder that may hold the masks of all views."""
-    with suppress(OSError):
-        return sorted(path for path in root.iterdir() if path.suffix.lower() in (".json", ".xml"))[:_MOST_FILES]
-    return []
+    return [path for path in _entries(root) if path.suffix.lower() in (".json", ".xml")][:_MOST_FILES]
 
 
 def _has_detections(folder: Path) -> bool:
