@@ -16,8 +16,7 @@ from gsseg_core.text import quoted
 
 def is_coco(place: Place) -> bool:
     """Recognise COCO: an object with the lists `images` and `annotations`."""
-    content = place.sample[1]
-    return isinstance(content, dict) and all(isinstance(content.get(key), list) for key in ("images", "annotations"))
+    return place.sample_has(images=list, annotations=list)
 
 
 def read_coco(place: Place) -> MaskSet:

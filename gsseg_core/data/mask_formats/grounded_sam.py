@@ -14,8 +14,7 @@ from gsseg_core.data.mask_formats.shapes import Runs
 
 def is_grounded_sam(place: Place) -> bool:
     """Recognise Grounded SAM 2: an object with the list `annotations`, and `img_width`."""
-    content = place.sample[1]
-    return isinstance(content, dict) and isinstance(content.get("annotations"), list) and "img_width" in content
+    return place.sample_has(annotations=list, img_width=object)
 
 
 def parse_grounded_sam(whole: Record) -> NamedDrawing:

@@ -13,9 +13,7 @@ from gsseg_core.data.mask_formats.shapes import Polygons
 
 def is_isat(place: Place) -> bool:
     """Recognise ISAT: an object with the object `info` and the list `objects`."""
-    content = place.sample[1]
-    info, objects = (content.get("info"), content.get("objects")) if isinstance(content, dict) else (None, None)
-    return isinstance(info, dict) and isinstance(objects, list)
+    return place.sample_has(info=dict, objects=list)
 
 
 def parse_isat(whole: Record) -> NamedDrawing:

@@ -26,10 +26,7 @@ _KINDS = ("rectangle", "circle", "mask")
 
 def is_labelme(place: Place) -> bool:
     """Recognise LabelMe: an object with the list `shapes`, and `imagePath` or `imageHeight`."""
-    content = place.sample[1]
-    if not isinstance(content, dict) or not isinstance(content.get("shapes"), list):
-        return False
-    return "imagePath" in content or "imageHeight" in content
+    return any(place.sample_has(shapes=list, **{key: object}) for key in ("imagePath", "imageHeight"))
 
 
 def parse_labelme(whole: Record) -> NamedDrawing:

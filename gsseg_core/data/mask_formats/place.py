@@ -143,6 +143,13 @@ class Place:
                 break
         return path, content
 
+    def sample_has(self, **fields: type) -> bool:
+        """Tell whether the sample is an object with these fields, each of a type; `object` is any."""
+        content = self.sample[1]
+        return isinstance(content, dict) and all(
+            key in content and isinstance(content[key], kind) for key, kind in fields.items()
+        )
+
     def only(self, suffix: str) -> Path | None:
         """Find the only file with a suffix, the place itself perhaps; None where single views have masks beside it."""
         files = [path for path in self.entries or [self.path] if path.suffix.lower() == suffix and path.is_file()]
