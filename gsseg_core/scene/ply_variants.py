@@ -39,11 +39,11 @@ def read_3dgs(path: Path, within: Path | None = None) -> ReadScene:
     if set(_DEGREE_4).issubset(names):
         kept = np.arange(len(_DEGREE_4)).reshape(3, -1)[:, : REST_COUNTS[-1] // 3].ravel()  # All of red comes first.
         moved = {name: vertices[_DEGREE_4[i]] for name, i in zip(rest_names(REST_COUNTS[-1]), kept, strict=True)}
-        return ReadScene(_with(vertices, moved, set(_DEGREE_4) - set(moved)), "", (SH_LEFT_OUT,))
+        return ReadScene(_with(vertices, moved, set(_DEGREE_4) - set(moved)), remarks=(SH_LEFT_OUT,))
     if DC[0] in names or OPACITY[0] not in names or not set(_RGB).issubset(names):
         return ReadScene(vertices)
     dc = dc_of(columns(vertices, _RGB) / 255)
-    return ReadScene(_with(vertices, dict(zip(DC, dc.T, strict=True))), "", ("colours in 8 bits instead of SH",))
+    return ReadScene(_with(vertices, dict(zip(DC, dc.T, strict=True))), remarks=("colours in 8 bits instead of SH",))
 
 
 def is_mip_splatting(head: bytes) -> bool:
@@ -71,7 +71,8 @@ def read_mip_splatting(path: Path, within: Path | None = None) -> ReadScene:
     # Where nothing is smoothed, the logit of an opacity near 1 stays as exact as it was.
     logit = np.where(size[:, 0] > 0, logit, vertices[OPACITY[0]])
     changed = {**dict(zip(SCALES, grown.T, strict=True)), OPACITY[0]: logit}
-    return ReadScene(_with(vertices, changed, without={_FILTER}), "", ("filter_3D is fused into scales and opacities",))
+    fused = _with(vertices, changed, without={_FILTER})
+    return ReadScene(fused, remarks=("filter_3D is fused into scales and opacities",))
 
 
 def is_2dgs(head: bytes) -> bool:
@@ -85,7 +86,7 @@ def read_2dgs(path: Path, within: Path | None = None) -> ReadScene:
     vertices = read_vertices(path, within)
     check_properties(vertices, SCALES[:2], str(path))
     thin = np.minimum(vertices[SCALES[0]], vertices[SCALES[1]]) + _FLATNESS
-    return ReadScene(_with(vertices, {SCALES[2]: thin}), "", ("discs, made a thousandth as thick as wide",))
+    return ReadScene(_with(vertices, {SCALES[2]: thin}), remarks=("discs, made a thousandth as thick as wide",))
 
 
 def _properties(head: bytes) -> set[bytes]:
