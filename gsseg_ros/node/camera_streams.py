@@ -93,7 +93,7 @@ class CameraStreams:
         """Make a source of its poses; every pairing has one of its own."""
         settings, tf = self._settings, self._tf
         if settings.pose_source == "odometry":
-            return InterpolatedPoses(frames=self._frames, tells_apart=self._frames.tells_apart)
+            return InterpolatedPoses(frames=self._frames)
         if tf is not None and settings.pose_source == "tf":
             return tf
         if tf is not None and settings.pose_source == "auto":

@@ -61,8 +61,13 @@ class Complaints:
                 said.left_out += 1
                 said.last = message
 
+    def remind(self, kind: str, message: str) -> None:
+        """Warn of a lasting condition, unless the message is empty or that would be too often: it is not counted."""
+        if message and self.due(kind):
+            self.add(kind, message)
+
     def due(self, kind: str) -> bool:
-        """Whether a kind may be warned of now; a lasting condition asks this first, since it need not be counted."""
+        """Whether a kind may be warned of now."""
         with self._lock:
             return self._is_due(self._of(kind))
 

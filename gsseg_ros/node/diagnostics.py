@@ -110,14 +110,11 @@ def why_dropped(inputs: Inputs, reason: str) -> str:
 
 def complain(complaints: Complaints, inputs: Inputs | None, clock_problem: str) -> None:
     """Warn in the log of missing inputs, lost masks and other nodes of this name; call it once a second."""
-    if clock_problem and complaints.due(CLOCK):
-        complaints.add(CLOCK, clock_problem)
+    complaints.remind(CLOCK, clock_problem)
     if inputs is not None:
         for role, line in missing_inputs(inputs).items():
-            if complaints.due(MISSING[role]):
-                complaints.add(MISSING[role], line)
-        if (others := namesakes(inputs)) and complaints.due(NAMESAKES):
-            complaints.add(NAMESAKES, others)
+            complaints.remind(MISSING[role], line)
+        complaints.remind(NAMESAKES, namesakes(inputs))
         _complain_of_losses(complaints, inputs)
     complaints.flush()
 

@@ -16,21 +16,22 @@ from rclpy.callback_groups import MutuallyExclusiveCallbackGroup
 from rclpy.lifecycle import LifecycleNode
 from sensor_msgs.msg import CompressedImage
 
+from gsseg_core.data.class_names import listed
 from gsseg_core.data.soft_masks import SeenLabels
 from gsseg_core.data.view import View
 from gsseg_core.errors import GssegError
 from gsseg_core.live.results import SCENE_CHANGED, Rejection
 from gsseg_ros.camera_infos import image_size
-from gsseg_ros.errors import DepthImageError, NoSceneError, TooManyPixelsError
+from gsseg_ros.errors import DepthImageError, LabelInfoError, NoSceneError, TooManyPixelsError
 from gsseg_ros.node.camera_images import CameraImages
 from gsseg_ros.node.camera_streams import CameraStreams, camera_of, mask_class
-from gsseg_ros.node.complaints import DETECTIONS_TYPE, LIVE, PERIOD, REFUSED_POSE, Complaints
+from gsseg_ros.node.complaints import DETECTIONS_TYPE, LIVE, PERIOD, REFUSED_LABELS, REFUSED_POSE, Complaints
 from gsseg_ros.node.depth_images import gate_by_image
 from gsseg_ros.node.jobs import Worker
 from gsseg_ros.node.live_outputs import LiveOutputs
+from gsseg_ros.node.masks import label_info
 from gsseg_ros.node.masks.compressed import compressed_topic
 from gsseg_ros.node.masks.detections_input import DetectionsInput
-from gsseg_ros.node.masks.label_info import TOPIC, LabelInfoInput, label_info_class
 from gsseg_ros.node.masks.reader import MaskReader
 from gsseg_ros.node.matched_subscription import MatchedSubscription
 from gsseg_ros.node.outputs import Outputs
@@ -42,6 +43,7 @@ from gsseg_ros.node.workspace import Workspace
 
 EXPIRE_PERIOD = 0.1  # s
 _MASKS = ("mask", "detections")  # Roles of what becomes views.
+_REASONS = {TooManyPixelsError: "too_large", DepthImageError: "bad_depth"}  # Others are those of the core.
 
 AWAITED_SECONDS, _PAUSE = 5.0, 0.02
 """How long, at most, masks are waited for that have come and are not yet fused."""
@@ -90,12 +92,11 @@ class Inputs:
         built.callback(self.live.close)
         compressed = settings.image_transport == "compressed"
         self._masks = MaskReader(settings, workspace.label_space, self._say_once)
-        self.label_info = LabelInfoInput(node, workspace.label_space, self._complaints)
         self.cameras: dict[str, CameraStreams] = {}  # by name; "" if there is only one
         self.detections: list[DetectionsInput] = []
         self._images: list[CameraImages] = []
-        if (kind := label_info_class()) is not None:  # It is not missed: names come once, if at all.
-            self._listen(built, kind, TOPIC, TOPIC, lambda _, names: self.label_info.on_label_info(names), False)
+        if (kind := label_info.label_info_class()) is not None:  # It is not missed: names come once, if at all.
+            self._listen(built, kind, label_info.TOPIC, label_info.TOPIC, self.on_label_info, False)
         # A simulator's stamps repeat, and views of an earlier activation may come back with a saved state.
         activation = secrets.token_hex(4)
         workspace.activations.add(activation)
@@ -211,6 +212,16 @@ class Inputs:
             built.callback(subscription.close)
         return subscription
 
+    def on_label_info(self, topic: str, message: Any) -> None:
+        """Take in names of labels."""
+        try:
+            names = label_info.names_of(message, topic)
+        except LabelInfoError as error:
+            self._complaints.add(REFUSED_LABELS, str(error))
+            return
+        if self._workspace.label_space.hear(names):
+            self._node.get_logger().info(f"{topic}: labels are called {listed(names.values())}")
+
     def _refuse_pose(self, why: str) -> None:
         self.refused_poses += 1
         self.last_refusal = (time.monotonic(), why)
@@ -235,9 +246,7 @@ class Inputs:
         for images in self._images:
             images.tick()
         for detections in self.detections:
-            problem = detections.look()
-            if problem and self._complaints.due(DETECTIONS_TYPE):
-                self._complaints.add(DETECTIONS_TYPE, problem)
+            self._complaints.remind(DETECTIONS_TYPE, detections.look())
         self.live.tick()
 
     def _hand_over(self) -> None:
@@ -274,12 +283,9 @@ class Inputs:
             rejection = self._fused(paired)
         except NoSceneError as error:
             rejection = Rejection("no_scene", str(error))
-        except TooManyPixelsError as error:
-            rejection = self._workspace.session.reject(Rejection("too_large", str(error)))
-        except DepthImageError as error:
-            rejection = self._workspace.session.reject(Rejection("bad_depth", str(error)))
         except GssegError as error:
-            rejection = self._workspace.session.reject(Rejection.of(error))
+            reason = _REASONS.get(type(error))
+            rejection = self._workspace.session.reject(Rejection(reason, str(error)) if reason else Rejection.of(error))
         except Exception as error:
             self._node.get_logger().error(f"mask {paired.name}: unexpected {type(error).__name__}: {error}")
             rejection = Rejection("unexpected", str(error))

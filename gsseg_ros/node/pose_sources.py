@@ -178,12 +178,13 @@ class MessagePoses:
 class InterpolatedPoses(MessagePoses):
     """Poses of an odometry, which runs at its own rate: between the two that bracket a mask's stamp.
 
-    The two may be so many seconds apart. `tells_apart` says whether `frames` knows where on the robot each camera is.
+    The two may be so many seconds apart.
     """
 
-    def __init__(self, max_gap_s: float = 0.2, frames: PoseFrames | None = None, tells_apart: bool = False) -> None:
+    def __init__(self, max_gap_s: float = 0.2, frames: PoseFrames | None = None) -> None:
         super().__init__(0.0, frames)
-        self._max_gap_ns, self.knows_frames, self._bridges = round(max_gap_s * SECOND), tells_apart, True
+        self._max_gap_ns, self._bridges = round(max_gap_s * SECOND), True
+        self.knows_frames = frames is not None and frames.tells_apart
 
     def _given(self, stamp: int, last_chance: bool) -> GivenPose | None:
         exact, stamps = self._poses.values.get(stamp), self._poses.stamps

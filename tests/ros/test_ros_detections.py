@@ -15,8 +15,8 @@ from gsseg_core.errors import MaskFormatError, UnknownLabelError
 from gsseg_ros.conversions import stamp_message
 from gsseg_ros.errors import TooManyPixelsError
 from gsseg_ros.node.masks import detections_input, vision_detections, yolo_detections
-from gsseg_ros.node.masks.detections import ADAPTERS, MOST_DETECTIONS, Beside, Detected
-from gsseg_ros.node.masks.detections_input import DetectionsInput
+from gsseg_ros.node.masks.detections import MOST_DETECTIONS, Beside, Detected
+from gsseg_ros.node.masks.detections_input import ADAPTERS, DetectionsInput
 
 TOPIC = "/some/topic"
 SIZE = (8, 6)

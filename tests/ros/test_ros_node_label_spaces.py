@@ -23,9 +23,9 @@ from small_scenes import clean_views
 from gsseg_core.data.view import View
 from gsseg_core.scene.gaussian_scene import GaussianScene
 from gsseg_ros.conversions import mask_image
-from gsseg_ros.node import inputs
 from gsseg_ros.node.masks import label_info
-from gsseg_ros.node.masks.detections import ADAPTERS, Detected
+from gsseg_ros.node.masks.detections import Detected
+from gsseg_ros.node.masks.detections_input import ADAPTERS
 
 NAMES = {0: "background", 1: "red ball", 2: "cup/mug", 3: "box"}
 YOLO, VISION = ADAPTERS.values()
@@ -50,7 +50,7 @@ def node(
 def tell(here: NodeHere, names: dict[int, str]) -> None:
     """Hand over a label_info."""
     entries = [Fields(class_id=k, class_name=name) for k, name in names.items()]
-    here.inputs.label_info.on_label_info(Fields(class_map=entries))
+    here.inputs.on_label_info(here.node.resolve_topic_name("label_info"), Fields(class_map=entries))
 
 
 class LabelInfo(CameraInfo):
@@ -61,7 +61,7 @@ class LabelInfo(CameraInfo):
 def test_label_info_is_heard_latched_from_before_and_otherwise(
     shared: Ros, parameters: dict[str, Any], monkeypatch: pytest.MonkeyPatch, latched: bool
 ) -> None:
-    monkeypatch.setattr(inputs, "label_info_class", lambda: LabelInfo)
+    monkeypatch.setattr(label_info, "label_info_class", lambda: LabelInfo)
     monkeypatch.setattr(label_info, "names_of", lambda message, topic: {message.width: "cup"})
     publisher = shared.node.create_publisher(CameraInfo, "label_info", LATCHED if latched else 1)
     publisher.publish(CameraInfo(width=7))

@@ -22,7 +22,9 @@ from sensor_msgs.msg import PointCloud2
 from small_scenes import clean_views, lost_half_way
 
 from gsseg_ros.node import diagnostics, live_outputs, services
-from gsseg_ros.node.masks.detections import ADAPTERS, Adapter
+from gsseg_ros.node.masks.detections import Adapter
+from gsseg_ros.node.masks.detections_input import ADAPTERS
+from gsseg_ros.node.masks.yolo_detections import named_mask
 from gsseg_ros.node.reports import Selection
 
 SIDES = ("left", "right")
@@ -103,7 +105,7 @@ def test_each_of_two_exchanged_topics_is_heard_as_its_own_publisher_offers(
 ) -> None:
     values = {**parameters, "cameras": list(SIDES), "detections_topic": "found", "ids": "given"}
     rules = [f"{one}/{name}:={two}/{name}" for name in ("pose", "found") for one, two in (SIDES, SIDES[::-1])]
-    monkeypatch.setitem(ADAPTERS, "nav_msgs/msg/Odometry", Adapter("nav_msgs", "Odometry", False, ""))
+    monkeypatch.setitem(ADAPTERS, "nav_msgs/msg/Odometry", Adapter("nav_msgs", "Odometry", False, named_mask))
     ros.node.create_publisher(Odometry, "/left/found", 1)
     for side, reliability in zip(SIDES, (ReliabilityPolicy.RELIABLE, ReliabilityPolicy.BEST_EFFORT), strict=True):
         ros.node.create_publisher(PoseStamped, f"/{side}/pose", QoSProfile(depth=1, reliability=reliability))

@@ -49,7 +49,7 @@ class Adapter:
     package: str  # of the message
     name: str  # of the message
     takes_mask: bool  # whether the pixels of its detections are those of a mask, which comes beside it
-    module: str  # where `named_mask` is, which makes a `NamedMask` of a message, the name of its topic and `Beside`
+    named_mask: Callable[[Any, str, Beside], NamedMask]  # makes a mask of a message and the name of its topic
 
     @property
     def type(self) -> str:
@@ -60,23 +60,6 @@ class Adapter:
     def message_class(self) -> Any:
         """Class of the messages; raises ImportError where the package is not installed."""
         return getattr(import_module(f"{self.package}.msg"), self.name)
-
-    @property
-    def named_mask(self) -> Callable[..., NamedMask]:
-        """What makes masks of messages."""
-        reader: Callable[..., NamedMask] = import_module(self.module).named_mask
-        return reader
-
-
-_MASKS = "gsseg_ros.node.masks"
-ADAPTERS = {
-    adapter.type: adapter
-    for adapter in (
-        Adapter("yolo_msgs", "DetectionArray", False, f"{_MASKS}.yolo_detections"),
-        Adapter("vision_msgs", "Detection2DArray", True, f"{_MASKS}.vision_detections"),
-    )
-}
-"""By type of message: what the parameter detections_topic takes."""
 
 
 def checked_name(name: str, number: object, topic: str) -> str:

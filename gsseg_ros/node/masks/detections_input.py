@@ -10,8 +10,18 @@ from rclpy.node import Node
 
 from gsseg_ros.conversions import stamp_ns
 from gsseg_ros.node.history import too_many
-from gsseg_ros.node.masks.detections import ADAPTERS, Adapter, Detected
+from gsseg_ros.node.masks import vision_detections, yolo_detections
+from gsseg_ros.node.masks.detections import Adapter, Detected
 from gsseg_ros.node.pairing import MOST_BYTES
+
+ADAPTERS = {
+    adapter.type: adapter
+    for adapter in (
+        Adapter("yolo_msgs", "DetectionArray", False, yolo_detections.named_mask),
+        Adapter("vision_msgs", "Detection2DArray", True, vision_detections.named_mask),
+    )
+}
+"""By type of message: what the parameter detections_topic takes."""
 
 Take: TypeAlias = Callable[[str, Any], None]
 """A function that takes in the name of a topic and a message."""

@@ -8,14 +8,11 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
-from rclpy.node import Node
 from std_msgs.msg import Header
 
-from gsseg_core.data.class_names import flaw_of_class_name, listed
+from gsseg_core.data.class_names import flaw_of_class_name
 from gsseg_core.files.limits import MAX_LABEL
 from gsseg_ros.errors import LabelInfoError
-from gsseg_ros.node.complaints import REFUSED_LABELS, Complaints
-from gsseg_ros.node.masks.label_space import LabelSpace
 
 TOPIC = "label_info"
 
@@ -54,21 +51,3 @@ def label_info(names: Mapping[int, str], header: Header) -> Any:
 
     class_map = [VisionClass(class_id=k, class_name=name) for k, name in sorted(names.items())]
     return LabelInfo(header=header, class_map=class_map)
-
-
-class LabelInfoInput:
-    """Takes in names of labels."""
-
-    def __init__(self, node: Node, label_space: LabelSpace, complaints: Complaints) -> None:
-        self._node, self._label_space, self._complaints = node, label_space, complaints
-
-    def on_label_info(self, message: Any) -> None:
-        """Take in names."""
-        topic = self._node.resolve_topic_name(TOPIC)
-        try:
-            names = names_of(message, topic)
-        except LabelInfoError as error:
-            self._complaints.add(REFUSED_LABELS, str(error))
-            return
-        if self._label_space.hear(names):
-            self._node.get_logger().info(f"{topic}: labels are called {listed(names.values())}")
