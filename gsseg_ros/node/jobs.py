@@ -126,9 +126,7 @@ class Worker(Generic[T]):
     may wait whatever its size.
     """
 
-    def __init__(
-        self, handle: Callable[[T], None], capacity: int, size: Callable[[T], int] = lambda item: 0, most_bytes: int = 0
-    ) -> None:
+    def __init__(self, handle: Callable[[T], None], capacity: int, size: Callable[[T], int], most_bytes: int) -> None:
         self.dropped = 0  # items
         self._handle, self._capacity, self._size, self._most_bytes = handle, capacity, size, most_bytes
         self._items: deque[T] = deque()

@@ -6,7 +6,7 @@ import math
 import signal
 import sys
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import Any
 
@@ -25,7 +25,7 @@ from sensor_msgs.msg import CameraInfo, Image
 from gsseg_core.errors import GssegError, SettingsError
 from gsseg_core.freed_memory import search_no_imports_at_the_end
 from gsseg_ros.conversions import parameter_descriptor, passed_over, stamp_message
-from gsseg_ros.replay.sources import TYPES, BagSource, FolderSource, Group, Source
+from gsseg_ros.replay.sources import TYPES, BagSource, FolderSource, Group
 from gsseg_ros.shared_memory import make_room
 
 _CLASSES = {
@@ -143,8 +143,11 @@ class ReplayNode(Node):
                 raise SettingsError(f"parameter '{name}': {reason}; expected {kind}{limits}") from None
         return values
 
-    def replay(self, source: Source, rate: float, loop: int) -> None:
-        """Publish all that the source holds, `rate` masks per second, `loop` times (0: until stopped)."""
+    def replay(self, source: Iterable[Group], rate: float, loop: int) -> None:
+        """Publish all that the source holds, `rate` masks per second, `loop` times (0: until stopped).
+
+        Each time the source is iterated over anew; what it gives is in order of `due`.
+        """
         start, offset, passes = time.monotonic(), 0.0, 0
         while loop == 0 or passes < loop:
             last = 0.0
@@ -212,7 +215,7 @@ class ReplayNode(Node):
         raise Stopped
 
 
-def make_source(settings: dict[str, Any]) -> Source:
+def make_source(settings: dict[str, Any]) -> FolderSource | BagSource:
     """Open the folder or bag that the parameters name."""
     data, bag = settings["data"], settings["bag"]
     if bool(data) == bool(bag):

@@ -11,7 +11,7 @@ import os
 from collections.abc import Iterator, Mapping
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple, Protocol
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -56,17 +56,6 @@ class Group(NamedTuple):
     messages: tuple[tuple[str, Any], ...]  # each with its topic, a key of `TYPES`
 
 
-class Source(Protocol):
-    """A folder or a bag; each iteration is one pass through it, in order of `due`."""
-
-    @property
-    def description(self) -> str:
-        """What is replayed, in words for the log."""
-
-    def __iter__(self) -> Iterator[Group]:
-        """Start a pass."""
-
-
 class FolderSource:
     """The views of a dataset folder, each a group of mask, camera_info, pose and, where there is a photo, image.
 
@@ -94,6 +83,7 @@ class FolderSource:
                 f"{Path(folder) / labels}: no label image for any of the {len(views)} views of split '{split}'; "
                 f"expected {views[0].name}.png and so on"
             )
+        # What is replayed, in words for the log.
         self.description = f"{len(self._views)} views (split '{split}') of {folder}"
         self._frame_id, self._map_frame = frame_id, map_frame
 

@@ -14,7 +14,7 @@ from typing import Any, TypeVar
 
 import pytest
 from patience import PATIENCE
-from ros_helpers import Process, Ros, wait_until
+from ros_helpers import Process, Ros, private_ros, wait_until
 from small_scenes import NAMES, write_dataset
 
 from gsseg_core.data.dataset import Dataset
@@ -36,32 +36,25 @@ def start_node(ros: Ros, folder: Path, **parameters: Any) -> Process:
 class Place:
     """A node that is active, a client, and a dataset `data` below the node's data_root."""
 
-    def __init__(self, folder: Path) -> None:
-        self.folder = folder
+    def __init__(self, folder: Path, ros: Ros, client: SegmentationClient) -> None:
+        self.folder, self.ros, self.client = folder, ros, client
         write_dataset(folder / "data")
-        self.ros = Ros(folder)
-        self.node = start_node(self.ros, folder)
-        self.client = SegmentationClient(domain_id=self.ros.domain, find_timeout=PATIENCE)
+        self.node = start_node(ros, folder)
+        client.wait_until_active(PATIENCE)
 
     @property
     def views(self) -> list[View]:
         return Dataset(self.folder / "data").views("all")
 
-    def close(self) -> None:
-        self.client.close()
-        self.ros.close()
-
 
 @pytest.fixture(name="shared", scope="module")
 def shared_fixture(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Place]:
     folder = tmp_path_factory.mktemp("client")
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setenv("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST")
-        patch.setenv("ROS_LOG_DIR", str(folder / "ros_log"))
-        place = Place(folder)
-        place.client.wait_until_active(PATIENCE)
-        yield place
-        place.close()
+    with (
+        private_ros(folder) as ros,
+        SegmentationClient(domain_id=ros.domain, find_timeout=PATIENCE) as client,
+    ):
+        yield Place(folder, ros, client)
 
 
 @pytest.fixture(name="place")

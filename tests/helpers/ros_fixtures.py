@@ -16,8 +16,8 @@ from typing import Any
 import pytest
 from rclpy.parameter import Parameter
 from ros_datasets import copied, write_long_dataset
-from ros_helpers import PATIENCE, Ros
-from ros_robot import CLASSES, Robot, core_session, private_ros
+from ros_helpers import PATIENCE, Ros, private_ros
+from ros_robot import CLASSES, Robot, core_session
 from small_scenes import balls_on_a_table, clean_views, write_dataset
 
 from gsseg_core.scene.gaussian_scene import GaussianScene

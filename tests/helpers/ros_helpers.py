@@ -262,11 +262,21 @@ def _plain(value: Any) -> Any:
     return str(value) if isinstance(value, Path) else value
 
 
+@contextmanager
+def private_ros(folder: Path) -> Iterator[Ros]:
+    """A private context, node and spinning thread, and processes in the same domain; all gone after the body."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST")
+        patch.setenv("ROS_LOG_DIR", str(folder / "ros_log"))
+        ros = Ros(folder)
+        try:
+            yield ros
+        finally:
+            ros.close()
+
+
 @pytest.fixture(name="ros")
-def ros_fixture(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Ros]:
-    """A private context, node and spinning thread, and processes in the same domain; all gone after the test."""
-    monkeypatch.setenv("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST")
-    monkeypatch.setenv("ROS_LOG_DIR", str(tmp_path / "ros_log"))
-    ros = Ros(tmp_path)
-    yield ros
-    ros.close()
+def ros_fixture(tmp_path: Path) -> Iterator[Ros]:
+    """A `Ros` for one test."""
+    with private_ros(tmp_path) as ros:
+        yield ros

@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import json
 import time
-from collections.abc import Callable, Iterable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -335,19 +334,6 @@ class Robot:
         except pytest.fail.Exception as failure:
             pytest.fail(f"{failure}\nlast status: {json.dumps(last, indent=1)}")
         return last
-
-
-@contextmanager
-def private_ros(folder: Path) -> Iterator[Ros]:
-    """A `Ros` for a whole module, as the fixture `ros` is one for a test."""
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setenv("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST")
-        patch.setenv("ROS_LOG_DIR", str(folder / "ros_log"))
-        ros = Ros(folder)
-        try:
-            yield ros
-        finally:
-            ros.close()
 
 
 def messages(view: View, stamp: int, similarity: Similarity = IDENTITY) -> dict[str, Any]:

@@ -14,8 +14,9 @@ from action_msgs.srv import CancelGoal
 from gsseg_msgs.action import Learn
 from mask_writers import sam_json
 from ros_datasets import copied, write_long_dataset
+from ros_fixtures import parameters_fixture, running_fixture, scene_fixture, shared_fixture  # noqa: F401
 from ros_helpers import Ros
-from ros_robot import CLASSES, Goal, Robot, assert_same, private_ros, renamed
+from ros_robot import CLASSES, Goal, Robot, assert_same, renamed
 from small_scenes import clean_views, taught, write_dataset, wrong_views
 
 from gsseg_core.data.dataset import Dataset
@@ -36,23 +37,6 @@ def root(tmp_path_factory: pytest.TempPathFactory) -> Path:
     write_dataset(root / "data")
     write_long_dataset(root / "long")
     return root
-
-
-@pytest.fixture(scope="module")
-def scene(root: Path) -> GaussianScene:
-    return GaussianScene.load(root / "data" / "scene.ply")
-
-
-@pytest.fixture(scope="module")
-def ros(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Ros]:
-    with private_ros(tmp_path_factory.mktemp("ros")) as ros:
-        yield ros
-
-
-@pytest.fixture(scope="module")
-def running(ros: Ros, root: Path) -> Robot:
-    parameters = {"scene_path": root / "data" / "scene.ply", "data_root": root, "class_names": CLASSES}
-    return Robot(ros).started(parameters)
 
 
 @pytest.fixture
@@ -380,8 +364,8 @@ def test_views_of_a_dataset_that_cannot_be_used_are_left_out_and_reported(
     assert_learnt(robot, expected(scene, [v for v in Dataset(folder).views("train") if v.name != "view1"]))
 
 
-def test_without_declared_classes_those_of_the_dataset_are_taken_over(ros: Ros, root: Path) -> None:
-    robot = Robot(ros, "/undeclared").started({"scene_path": root / "data" / "scene.ply", "data_root": root})
+def test_without_declared_classes_those_of_the_dataset_are_taken_over(shared: Ros, root: Path) -> None:
+    robot = Robot(shared, "/undeclared").started({"scene_path": root / "data" / "scene.ply", "data_root": root})
     status, result = robot.learn(dataset_path="data")
     assert status == GoalStatus.STATUS_SUCCEEDED, result.error_msg
     assert [summary.name for summary in result.report.classes] == CLASSES

@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from typing import Any
 
 import pytest
 from diagnostic_msgs.msg import DiagnosticStatus
-from ros_fixtures import parameters_fixture, root_fixture  # noqa: F401
+from ros_fixtures import parameters_fixture, root_fixture, shared_fixture  # noqa: F401
 from ros_helpers import Ros
-from ros_robot import RELIABLE, SECOND, STEP, Robot, messages, private_ros
+from ros_robot import RELIABLE, SECOND, STEP, Robot, messages
 from rosgraph_msgs.msg import Clock
 from sensor_msgs.msg import PointCloud2
 from small_scenes import clean_views
@@ -18,15 +17,9 @@ from gsseg_ros.conversions import stamp_message, stamp_ns
 
 
 @pytest.fixture(scope="module")
-def ros(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Ros]:
-    with private_ros(tmp_path_factory.mktemp("clock")) as ros:
-        yield ros
-
-
-@pytest.fixture(scope="module")
-def robot(ros: Ros, parameters: dict[str, Any]) -> Robot:
+def robot(shared: Ros, parameters: dict[str, Any]) -> Robot:
     """A node whose clock has not come yet; the tests of this file take it from there, each whatever came before."""
-    return Robot(ros).started({**parameters, "use_sim_time": True})
+    return Robot(shared).started({**parameters, "use_sim_time": True})
 
 
 @pytest.fixture(scope="module")

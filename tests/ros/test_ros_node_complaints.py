@@ -15,8 +15,8 @@ from lifecycle_msgs.msg import State
 from rclpy.lifecycle import LifecycleNode, TransitionCallbackReturn
 from rclpy.qos import DurabilityPolicy, ReliabilityPolicy
 from ros_fixtures import node_fixture, parameters_fixture, root_fixture  # noqa: F401
-from ros_helpers import Ros, ros_fixture  # noqa: F401
-from ros_robot import SECOND, Robot, private_ros
+from ros_helpers import Ros, private_ros, ros_fixture  # noqa: F401
+from ros_robot import SECOND, Robot
 from sensor_msgs.msg import Image
 from small_scenes import NUM_CLASSES, clean_views
 

@@ -18,8 +18,8 @@ from patience import PATIENCE
 from rclpy.parameter import Parameter
 from ros_checks import limited
 from ros_fixtures import parameters_fixture, root_fixture, shared_fixture, spun  # noqa: F401
-from ros_helpers import Ros
-from ros_robot import CLASSES, SERVICES, Goal, Learn, Robot, core_session, private_ros, viewpoint
+from ros_helpers import Ros, private_ros
+from ros_robot import CLASSES, SERVICES, Goal, Learn, Robot, core_session, viewpoint
 from small_scenes import build, clean_views
 
 from gsseg_ros.errors import PathNotAllowedError
