@@ -27,9 +27,8 @@ class DepthTolerance:
 
     def __post_init__(self) -> None:
         """Validate."""
-        for name in ("absolute", "relative"):
-            value = getattr(self, name)
-            if not (np.isfinite(value) and value >= 0):
+        for name, value in vars(self).items():
+            if not 0 <= value < np.inf:
                 raise SettingsError(f"depth_tolerance.{name} is {value:g}; expected 0 or more")
 
 

@@ -19,7 +19,8 @@ import numba as nb
 import numpy as np
 
 from gsseg_core.kernels.compiler import called_by_kernels
-from gsseg_core.raster.cpu.splat import OPEN, SIDE, WIDTH, aim, blend_block
+from gsseg_core.raster.constants import BLOCK
+from gsseg_core.raster.cpu.splat import OPEN, WIDTH, aim, blend_block
 from gsseg_core.raster.cpu.tiling import TILE, Tiles
 from gsseg_core.simd import AHEAD, first_bit, prefetch, store_row
 
@@ -35,7 +36,7 @@ class Records(NamedTuple):
 @nb.njit(inline="always")
 def in_block(r: int, c: int) -> tuple[int, int]:
     """Block of the pixel in row r and column c of a tile, and its place there."""
-    return r // SIDE * SIDE + c // SIDE, r % SIDE * SIDE + c % SIDE
+    return r // BLOCK * BLOCK + c // BLOCK, r % BLOCK * BLOCK + c % BLOCK
 
 
 @nb.njit(inline="always")

@@ -14,9 +14,9 @@ import numpy as np
 
 from gsseg_core.csr_rows import starts
 from gsseg_core.kernels.compiler import called_by_kernels, kernel
-from gsseg_core.raster.constants import CHUNKS
+from gsseg_core.raster.constants import BLOCK, CHUNKS
 from gsseg_core.raster.cpu.blending import aim_next, in_tile, open_rays, tile_of_turn
-from gsseg_core.raster.cpu.splat import OPEN, SIDE, WIDTH, lift_block
+from gsseg_core.raster.cpu.splat import OPEN, WIDTH, lift_block
 from gsseg_core.raster.cpu.tiling import TILE, Tiles
 from gsseg_core.simd import FAST, LANES, add, count_bits, first_bit, sum_row, where, zero_row
 
@@ -51,7 +51,7 @@ class Lifted(NamedTuple):
     def of(cls, tiles: Tiles, mask: np.ndarray, weights: np.ndarray | None = None) -> Lifted:
         """Lift a mask, (H, W) and negative where unknown, into a view; for weights see `ViewOperator.observe`."""
         mask = np.ascontiguousarray(mask, np.int32)
-        blocks = np.ones((tiles.rows * SIDE, tiles.columns * SIDE), np.float32)
+        blocks = np.ones((tiles.rows * BLOCK, tiles.columns * BLOCK), np.float32)
         if weights is not None:
             blocks[: weights.shape[0], : weights.shape[1]] = weights
         labels, areas = _cut(mask, blocks, tiles.columns, tiles.rows, int(mask.max(initial=0)) + 1)
@@ -95,7 +95,7 @@ def _cut(mask: np.ndarray, blocks: np.ndarray, columns: int, rows: int, num_labe
         left, top = (tile % columns) * TILE, (tile // columns) * TILE
         alike = _is_uniform(mask, left, top)
         for b in range(TILE):
-            begin, weights[tile, b] = spans, blocks[top // SIDE + b // SIDE, left // SIDE + b % SIDE]
+            begin, weights[tile, b] = spans, blocks[top // BLOCK + b // BLOCK, left // BLOCK + b % BLOCK]
             for lane in range(1 if alike else LANES):
                 r, c = in_tile(b, lane)
                 label = mask[top + r, left + c] if top + r < height and left + c < width else -1

@@ -10,6 +10,7 @@ import numpy as np
 
 from gsseg_core.csr_rows import CSRRows
 from gsseg_core.kernels.compiler import called_by_kernels, kernel
+from gsseg_core.raster.constants import BLOCK
 from gsseg_core.raster.cpu.blending import (
     aim_next,
     blend_tile,
@@ -20,7 +21,7 @@ from gsseg_core.raster.cpu.blending import (
     open_rays,
     tile_of_turn,
 )
-from gsseg_core.raster.cpu.splat import OPEN, SIDE, WIDTH, blend_block
+from gsseg_core.raster.cpu.splat import OPEN, WIDTH, blend_block
 from gsseg_core.raster.cpu.tiling import TILE, Tiles
 from gsseg_core.simd import (
     AHEAD,
@@ -128,11 +129,11 @@ def _blocks_of_grid(first: int, step: int, left: int, top: int) -> int:
     """Which blocks of a tile have pixels of a grid, as bits."""
     rows, columns = 0, 0
     for i in range(TILE):
-        rows |= (top + i >= first and (top + i - first) % step == 0) << i // SIDE
-        columns |= (left + i >= first and (left + i - first) % step == 0) << i // SIDE
+        rows |= (top + i >= first and (top + i - first) % step == 0) << i // BLOCK
+        columns |= (left + i >= first and (left + i - first) % step == 0) << i // BLOCK
     blocks = 0
     for b in range(TILE):
-        blocks |= (rows >> b // SIDE & columns >> b % SIDE & 1) << b
+        blocks |= (rows >> b // BLOCK & columns >> b % BLOCK & 1) << b
     return blocks
 
 

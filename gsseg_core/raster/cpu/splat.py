@@ -15,7 +15,6 @@ from numba.core import cgutils, types
 from gsseg_core.raster.constants import ALPHA_MAX, BLOCK, T_LIFTED, T_MIN
 from gsseg_core.simd import BITS, F32, I64, LANES, ROW, Builder, constant, operation, row_type
 
-SIDE = BLOCK
 OPEN = (1 << LANES) - 1  # of the bits of `blend_block`, those of the rays that are still open
 LOG_ALPHA_MIN = -math.log2(255.0)  # log2 of the least alpha that counts
 
@@ -23,11 +22,11 @@ LOG_ALPHA_MIN = -math.log2(255.0)  # log2 of the least alpha that counts
 U, V, SHEAR, WIDTH, HEIGHT, LOG_OPACITY, Y_REACH, X_TURN = range(8)
 
 _ROWS = ir.Constant(ROW, [float(r) for r in range(LANES)])
-_FOUR = ir.VectorType(F32, SIDE)
-_EACH_FOUR_TIMES = ir.Constant(BITS, [lane // SIDE for lane in range(LANES)])
+_FOUR = ir.VectorType(F32, BLOCK)
+_EACH_FOUR_TIMES = ir.Constant(BITS, [lane // BLOCK for lane in range(LANES)])
 _COLUMNS_OF_BLOCKS = ir.Constant(
-    ir.ArrayType(ROW, SIDE),
-    [ir.Constant(ROW, [float(SIDE * i + lane % SIDE) for lane in range(LANES)]) for i in range(SIDE)],
+    ir.ArrayType(ROW, BLOCK),
+    [ir.Constant(ROW, [float(BLOCK * i + lane % BLOCK) for lane in range(LANES)]) for i in range(BLOCK)],
 )
 
 
@@ -38,7 +37,7 @@ def _row_of_lines(build: Builder, pair: Any, i: int) -> Any:
 
 def _four_of(build: Builder, position: int, pair: Any, i: int, block: Any) -> Any:
     """Entries of row i of a pair of lines that belong to the four rows of a block, each four times."""
-    first = build.llvm.and_(block, ir.Constant(block.type, LANES - SIDE))
+    first = build.llvm.and_(block, ir.Constant(block.type, LANES - BLOCK))
     row = build.llvm.mul(_row_of_lines(build, pair, i), ir.Constant(pair.type, LANES))
     place = build.llvm.add(first, row)
     address = build.llvm.bitcast(build.element(position, place), ir.PointerType(_FOUR))
@@ -92,7 +91,7 @@ def _pixel_columns(build: Builder, block: Any) -> Any:
     """Columns in the tile of the pixels of a block."""
     insert: Any = cgutils.global_constant
     table = insert(build.llvm.module, "columns_of_blocks", _COLUMNS_OF_BLOCKS)
-    number = build.llvm.and_(block, ir.Constant(block.type, SIDE - 1))
+    number = build.llvm.and_(block, ir.Constant(block.type, BLOCK - 1))
     place = build.llvm.gep(table, [ir.Constant(block.type, 0), number], source_etype=_COLUMNS_OF_BLOCKS.type)
     return build.llvm.load(place, align=4, typ=ROW)
 
@@ -112,8 +111,8 @@ def aim(build: Builder, table: Any, g: Any, left: Any, top: Any, lines: Any, pai
     # In each row, no pixel of a block is nearer to the peak than this one, and its alpha is computed as `blend_block`
     # does: so the bits say exactly what will be found there.
     whole, bits = build.rint(x), ir.Constant(I64, 0)
-    for i in range(SIDE):
-        nearest = build.minimum(build.maximum(whole, constant(float(SIDE * i))), constant(SIDE * i + SIDE - 1.0))
+    for i in range(BLOCK):
+        nearest = build.minimum(build.maximum(whole, constant(float(BLOCK * i))), constant(BLOCK * i + BLOCK - 1.0))
         found = build.bits(_counts(build, _power(build, nearest, x, peak, wide)))
         bits = llvm.or_(bits, llvm.shl(found, ir.Constant(I64, LANES * i)))
     # Bit 16 i + r of these is row r's, in the i-th column of blocks. Rows of four are put together, and columns of

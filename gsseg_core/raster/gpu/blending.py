@@ -43,10 +43,11 @@ def pixel_of(thread: int) -> tuple[int, int]:
 
 
 @called_by_kernels
-def pixel_in(tile: int, columns: int, thread: int) -> tuple[int, int]:
-    """Row and column in the image of the pixel of a thread, where there are so many columns of tiles."""
-    row, column = pixel_of(thread)
-    return tile // columns * TILE + row, tile % columns * TILE + column
+def own_pixel(columns: int) -> tuple[int, int, int, int]:
+    """Tile and number of this thread, and row and column of its pixel in an image of so many columns of tiles."""
+    tile, t = cuda.blockIdx.x, cuda.threadIdx.x
+    row, column = pixel_of(t)
+    return tile, t, tile // columns * TILE + row, tile % columns * TILE + column
 
 
 @called_by_kernels
@@ -86,8 +87,7 @@ def blend_kernel(channels: int) -> Any:
         splats = cuda.shared.array((BATCH, 8), np.float32)
         own = cuda.shared.array((BATCH, channels), np.float32)
         values = cuda.local.array(channels, np.float32)
-        tile, t = cuda.blockIdx.x, cuda.threadIdx.x
-        row, column = pixel_in(tile, columns, t)
+        tile, t, row, column = own_pixel(columns)
         inside = row < left_over.shape[0] and column < left_over.shape[1]
         x, y = centre_of(row, column)
         ray = np.float32(1) if inside else _NOTHING

@@ -26,7 +26,7 @@ from gsseg_core.raster.gpu.blending import (
     alpha_of,
     centre_of,
     load_batch,
-    pixel_in,
+    own_pixel,
     weigh_batch,
 )
 from gsseg_core.raster.gpu.device import called_by_kernels, cuda, gpu_kernel, to_cpu
@@ -57,8 +57,7 @@ def number_labels(
     """Give numbers to the labels of one tile, in the order of the threads that first see them."""
     labels = cuda.shared.array(THREADS, np.int32)
     begins = cuda.shared.array(THREADS, np.int32)
-    tile, t = cuda.blockIdx.x, cuda.threadIdx.x
-    row, column = pixel_in(tile, columns, t)
+    tile, t, row, column = own_pixel(columns)
     label = mask[row, column] if row < mask.shape[0] and column < mask.shape[1] else np.int32(-1)
     labels[t] = label
     cuda.syncthreads()
@@ -84,8 +83,7 @@ def list_labels(
     present: np.ndarray,  # (label_start[-1],) int32 out: the labels of each tile
 ) -> None:  # fmt: skip
     """List the labels of one tile by their numbers."""
-    tile, t = cuda.blockIdx.x, cuda.threadIdx.x
-    row, column = pixel_in(tile, columns, t)
+    tile, t, row, column = own_pixel(columns)
     if slots[tile, t] >= 0:
         present[label_start[tile] + slots[tile, t]] = mask[row, column]
 
@@ -109,11 +107,10 @@ def lift(
     weighed = cuda.shared.array((BATCH, STRIDE), np.float32)
     slot_of = cuda.shared.array(THREADS, np.int16)
     counts = cuda.shared.array(THREADS, np.uint8)
-    tile, t = cuda.blockIdx.x, cuda.threadIdx.x
+    tile, t, row, column = own_pixel(columns)
     label_count = label_start[tile + 1] - label_start[tile]
     if label_count == 0:
         return
-    row, column = pixel_in(tile, columns, t)
     x, y = centre_of(row, column)
     slot_of[t] = slots[tile, t]
     counts[t] = slots[tile, t] >= 0 and weights[row // BLOCK, column // BLOCK] > 0
@@ -156,11 +153,10 @@ def share(
     slot_of = cuda.shared.array(THREADS, np.int16)
     only = cuda.shared.array(BATCH, np.float32)
     busy = cuda.shared.array(WARPS, np.uint8)
-    tile, t = cuda.blockIdx.x, cuda.threadIdx.x
+    tile, t, row, column = own_pixel(columns)
     label_count = label_start[tile + 1] - label_start[tile]
     if label_count == 0:
         return
-    row, column = pixel_in(tile, columns, t)
     slot, counts = slots[tile, t], _NOTHING
     if slot >= 0:
         counts = weights[row // BLOCK, column // BLOCK]

@@ -23,7 +23,7 @@ from gsseg_core.raster.gpu.blending import (
     alpha_of,
     centre_of,
     load_batch,
-    pixel_in,
+    own_pixel,
 )
 from gsseg_core.raster.gpu.device import called_by_kernels, cuda, gpu_kernel, launch, on_device, to_cpu
 from gsseg_core.raster.gpu.label_sharing import add_units
@@ -94,8 +94,7 @@ def _reasons_to_go(
     """Sum alphas over the pixels of one tile that show another label, where they do not hide the Gaussian."""
     splats = cuda.shared.array((BATCH, 8), np.float32)
     weighed = cuda.shared.array((BATCH, STRIDE), np.float32)
-    tile, t = cuda.blockIdx.x, cuda.threadIdx.x
-    row, column = pixel_in(tile, columns, t)
+    tile, t, row, column = own_pixel(columns)
     x, y = centre_of(row, column)
     seen, limit = _UNKNOWN, _NOTHING
     if row < shown.shape[0] and column < shown.shape[1]:
@@ -120,8 +119,7 @@ def _reasons_to_stay(
     """Sum alpha T_k / (1 - T_k) over the pixels of one tile that show the Gaussian's object k, for those asked for."""
     splats = cuda.shared.array((BATCH, 8), np.float32)
     weighed = cuda.shared.array((BATCH, STRIDE), np.float32)
-    tile, t = cuda.blockIdx.x, cuda.threadIdx.x
-    row, column = pixel_in(tile, columns, t)
+    tile, t, row, column = own_pixel(columns)
     x, y = centre_of(row, column)
     seen, wanted, through = _UNKNOWN, False, _ALL
     if row < shown.shape[0] and column < shown.shape[1]:
