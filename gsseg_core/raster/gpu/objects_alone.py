@@ -13,7 +13,7 @@ import torch
 
 from gsseg_core.data.label_evidence import UNITS
 from gsseg_core.raster.constants import T_MIN
-from gsseg_core.raster.cpu.silhouette_kernels import ROUNDING
+from gsseg_core.raster.cpu.objects_alone import ROUNDING
 from gsseg_core.raster.cpu.tiling import TILE
 from gsseg_core.raster.gpu.blending import (
     BATCH,
