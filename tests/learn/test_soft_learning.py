@@ -230,6 +230,12 @@ def test_what_stands_of_votes_is_what_a_slow_twin_keeps(rows: list[list[int]], i
     np.testing.assert_array_equal(resolved_votes(CSRRows.from_dense(votes), possible).dense(5), expected)
 
 
+def test_votes_against_what_is_no_class_do_not_make_the_first_of_several_classes_the_only_one_left() -> None:
+    against = CSRRows.from_dense(np.array([[0, -2, 0, -3], [0, -2, -4, -3]]))
+    found = resolved_votes(against, np.array([True, True, True, False])).dense(4)
+    np.testing.assert_array_equal(found, [[0, 0, 0, 0], [2, 0, 0, 0]])
+
+
 def normalised_votes(votes: np.ndarray, possible: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """The slow twin of `vote_shares`, before anything is imputed: shares (N, K), and which rows are left unsure."""
     codes, unsure = np.zeros(votes.shape, np.float32), np.zeros(len(votes), bool)
