@@ -11,6 +11,7 @@ Codes and error models are always here, too, so that whatever goes with a lost w
 from __future__ import annotations
 
 import time
+from collections import deque
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from concurrent.futures import CancelledError
 from functools import partial
@@ -112,12 +113,9 @@ class _OnWorkers(Learner):
             wanted = {name: by_view.get(name) for name in share.views if name in views}
             parts.append(self._submit(share.worker, task, share.shard, wanted, *(c[share.worker] for c in copies)))
         used += parts
-        sums = parts
+        sums = deque(parts)
         while len(sums) > 1:  # What is between leaves and root lives only as long as it is needed there.
-            pairs = zip(sums[::2], sums[1::2], strict=False)
-            sums = [self._client.submit(dask_worker.add, *pair, pure=False) for pair in pairs] + sums[
-                len(sums) // 2 * 2 :
-            ]
+            sums.append(self._client.submit(dask_worker.add, sums.popleft(), sums.popleft(), pure=False))
         used += sums
         sizes = {part.key: len(share.views) for part, share in zip(parts, shares, strict=True)}
         self._wait(used, lambda: report(sum(sizes[part.key] for part in parts if part.done())))
