@@ -35,8 +35,5 @@ def _left_in_groups(proc: Path, groups: Path) -> Iterator[int]:
 
 
 def _left_in(folder: Path, limit: str, used: str, cached: str) -> int:
-    left = int((folder / limit).read_text()) - int((folder / used).read_text())
-    for line in (folder / "memory.stat").read_text().splitlines():
-        if line.split()[0] == cached:
-            left += int(line.split()[1])
-    return left
+    given_up = dict(line.split() for line in (folder / "memory.stat").read_text().splitlines()).get(cached, 0)
+    return int((folder / limit).read_text()) - int((folder / used).read_text()) + int(given_up)
