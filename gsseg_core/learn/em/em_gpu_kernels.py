@@ -15,13 +15,12 @@ from gsseg_core.csr_rows import CSRRows
 from gsseg_core.data.label_evidence import UNITS, LabelEvidence
 from gsseg_core.learn.em.em_kernels import GRADIENT_UNIT, MAX_TERM
 from gsseg_core.learn.em.gpu_edges import scene_edges as scene_edges
-from gsseg_core.raster.gpu.device import called_by_kernels, cuda, find_gpu, gpu_kernel, launch, on_device, to_cpu
+from gsseg_core.raster.gpu.device import called_by_kernels, cuda, find_gpu, gpu_kernel, launch_each, on_device, to_cpu
 from gsseg_core.raster.gpu.gpu_observation import GPUObservation, ShareTensors
 from gsseg_core.raster.gpu.label_sharing import halves, joined
 from gsseg_core.raster.gpu.tensors import PairTensors, RowTensors, starts
 from gsseg_core.raster.observation import Observation
 
-THREADS = 128
 _CELLS = 1 << 20  # of all tables that are counted in, at most, unless one alone is larger
 _PX = 1 / GRADIENT_UNIT  # units of a px, in counts as in gradients
 _MOST = np.float32(MAX_TERM)
@@ -58,10 +57,6 @@ def zeros(rows: RowTensors, kind: type[np.generic]) -> torch.Tensor:
 _KINDS: dict[type[np.generic], torch.dtype] = {np.int64: torch.int64, np.float32: torch.float32}
 
 
-def _launch(kernel: Any, threads: int, *arguments: Any) -> None:
-    launch(kernel, -(-threads // THREADS), THREADS, *arguments)
-
-
 def rows_like(rows: RowTensors, ids: torch.Tensor) -> RowTensors:  # (M,)
     """Make M rows as long as those of `ids`, with nothing written into them."""
     indptr = starts(rows.indptr.diff()[ids.long()])
@@ -78,7 +73,7 @@ def shares(observation: Observation, codes: RowTensors, pairs: PairTensors, like
 def pair_likelihood(codes: RowTensors, pairs: PairTensors, likelihood: np.ndarray) -> torch.Tensor:
     """Likelihood of the label of each (Gaussian, label) pair, codes[i] . likelihood[y]: (P,) float32."""
     out = torch.empty(len(pairs.labels), device=codes.data.device)
-    _launch(_pair_likelihood, len(pairs.ids), *codes, *pairs, on_device(likelihood, out.device), out)
+    launch_each(_pair_likelihood, len(pairs.ids), *codes, *pairs, on_device(likelihood, out.device), out)
     return out
 
 
@@ -104,7 +99,7 @@ def _units(pixels: Any) -> Any:
 
 def accumulate(gradient: RowTensors, pairs: PairTensors, likelihood: np.ndarray, shares: torch.Tensor) -> None:
     """Add one view's term to the gradient: sum over a Gaussian's pairs of share times likelihood of the label."""
-    _launch(_accumulate, len(pairs.ids), *gradient, *pairs, on_device(likelihood, shares.device), shares)
+    launch_each(_accumulate, len(pairs.ids), *gradient, *pairs, on_device(likelihood, shares.device), shares)
 
 
 @gpu_kernel
@@ -127,7 +122,7 @@ def m_step_without_view(
 ) -> None:  # fmt: skip
     """M-step of the M Gaussians that a view sees, with the gradient less what `accumulate` added for this view."""
     of_labels = on_device(likelihood, shares.device)
-    _launch(_m_step_without_view, len(pairs.ids), *codes, gradient, prior, *pairs, of_labels, shares, *stepped)
+    launch_each(_m_step_without_view, len(pairs.ids), *codes, gradient, prior, *pairs, of_labels, shares, *stepped)
 
 
 @gpu_kernel
@@ -157,7 +152,7 @@ def confusion_counts(
 ) -> np.ndarray:
     """Sum over the pairs of codes[m] times share, by class and label, (K, L) float64; row m is of `pairs.ids[m]`."""
     counts = _counters(num_classes, num_labels, shares.device)
-    _launch(_confusion_counts, len(pairs.ids), *codes, *pairs[1:], shares, counts)
+    launch_each(_confusion_counts, len(pairs.ids), *codes, *pairs[1:], shares, counts)
     return _in_px(counts)
 
 
@@ -187,7 +182,7 @@ def subtract_votes(total: RowTensors, observation: Observation, label_votes: CSR
     """Subtract one view's votes, by `LabelEvidence.votes`, from those of all, N rows of int64, in place."""
     assert isinstance(observation, GPUObservation)
     pairs, own = observation.pairs, observation.own_votes
-    _launch(_subtract_votes, len(pairs.ids), *total, *pairs, own, *RowTensors.of(label_votes, own.device))
+    launch_each(_subtract_votes, len(pairs.ids), *total, *pairs, own, *RowTensors.of(label_votes, own.device))
 
 
 @gpu_kernel
@@ -224,7 +219,7 @@ def leave_one_out_counts(
     pairs, own = observation.pairs, observation.own_votes
     label_votes, rest = RowTensors.of(evidence.votes, own.device), rows_like(votes, pairs.ids)
     counts = _counters(len(possible), len(label_votes.indptr) - 1, own.device)
-    _launch(
+    launch_each(
         _leave_one_out, len(pairs.ids), *votes, *pairs, own, *label_votes, rest.indptr, rest.data, power,
         min(most, 1e30), counts,
     )  # fmt: skip

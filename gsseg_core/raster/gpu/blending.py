@@ -19,7 +19,8 @@ import numpy as np
 from gsseg_core.raster.constants import ALPHA_MAX, T_LIFTED, T_MIN
 from gsseg_core.raster.cpu.splat import HEIGHT, LOG_ALPHA_MIN, LOG_OPACITY, SHEAR, WIDTH, U, V
 from gsseg_core.raster.cpu.tiling import TILE
-from gsseg_core.raster.gpu.device import called_by_kernels, cuda, gpu_kernel
+from gsseg_core.raster.gpu.device import called_by_kernels, cuda, gpu_kernel, launch
+from gsseg_core.raster.gpu.projection import TileTensors
 
 THREADS = TILE * TILE
 BATCH = 32  # Gaussians whose weights are in shared memory at once
@@ -32,6 +33,12 @@ LIFTED = np.float32(T_LIFTED)
 _HALF_PIXEL = np.float32(0.5)
 _LEAST, _MOST, _LN2 = np.float32(LOG_ALPHA_MIN), np.float32(ALPHA_MAX), np.float32(math.log(2))
 _NOTHING = np.float32(0)
+
+
+def launch_on_tiles(kernel: Any, tiles: TileTensors, *arguments: Any) -> None:
+    """Start a kernel with a block of threads for each tile of a view, whose arrays it takes before the arguments."""
+    arrays = tiles.table, tiles.start, tiles.entries  # (M, 8), (T + 1,), (E,)
+    launch(kernel, tiles.columns * tiles.rows, THREADS, *arrays, tiles.columns, *arguments)
 
 
 @called_by_kernels
@@ -80,8 +87,8 @@ def blend_kernel(channels: int) -> Any:
 
     @gpu_kernel
     def blend(
-        table: np.ndarray, start: np.ndarray, entries: np.ndarray, codes: np.ndarray,  # (M, 8), (M, channels)
-        columns: int, image: np.ndarray, left_over: np.ndarray,  # (channels, H, W), (H, W) out
+        table: np.ndarray, start: np.ndarray, entries: np.ndarray, columns: int, codes: np.ndarray,  # (M, channels)
+        image: np.ndarray, left_over: np.ndarray,  # (channels, H, W), (H, W) out
     ) -> None:  # fmt: skip
         """Blend codes into one tile of an image."""
         splats = cuda.shared.array((BATCH, 8), np.float32)
@@ -139,8 +146,8 @@ CARRIED = 8  # channels that are carried back at once
 
 @gpu_kernel
 def carry_back(
-    table: np.ndarray, start: np.ndarray, entries: np.ndarray, place: np.ndarray,  # (M, 8), (T + 1,), (E,), (E,)
-    columns: int, residual: np.ndarray,  # (H, W, CARRIED)
+    table: np.ndarray, start: np.ndarray, entries: np.ndarray, columns: int,
+    place: np.ndarray, residual: np.ndarray,  # (E,), (H, W, CARRIED)
     sums: np.ndarray,  # (E, CARRIED) out: of each entry, at its place
 ) -> None:  # fmt: skip
     """Sum weights times values of the pixels of one tile, by entry."""

@@ -101,6 +101,12 @@ def launch(kernel: Any, blocks: int, threads: int, *arguments: Any) -> None:
         kernel[blocks, threads](*(_as_taken(a) if isinstance(a, torch.Tensor) else a for a in arguments))
 
 
+def launch_each(kernel: Any, count: int, *arguments: Any) -> None:
+    """Start a kernel with a thread for each of so many Gaussians."""
+    launch(kernel, -(-count // _THREADS), _THREADS, *arguments)
+
+
+_THREADS = 128  # of a block, where each does its work alone
 _STARTING = threading.Lock()
 _as_taken: Callable[[torch.Tensor], Any] = torch.Tensor.numpy if SIMULATED else cuda.as_cuda_array
 

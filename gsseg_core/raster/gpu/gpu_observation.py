@@ -11,8 +11,8 @@ import torch
 from gsseg_core.data.label_evidence import UNITS
 from gsseg_core.raster.constants import BLOCK
 from gsseg_core.raster.gpu import label_sharing as kernels
-from gsseg_core.raster.gpu.blending import THREADS
-from gsseg_core.raster.gpu.device import launch, on_device, to_cpu
+from gsseg_core.raster.gpu.blending import THREADS, launch_on_tiles
+from gsseg_core.raster.gpu.device import launch, launch_each, on_device, to_cpu
 from gsseg_core.raster.gpu.projection import TileTensors
 from gsseg_core.raster.gpu.tensors import PairTensors, RowTensors, starts
 from gsseg_core.raster.observation import Observation, VoteShares
@@ -64,10 +64,7 @@ class GPUObservation(Observation):
         slot_start = starts(tiles.start.diff() * label_counts)
         sums = torch.zeros(int(slot_start[-1]), dtype=torch.int64, device=device)
         reached = torch.zeros(len(tiles.entries), dtype=torch.uint8, device=device)
-        launch(
-            kernels.lift, len(label_counts), THREADS, tiles.table, tiles.start, tiles.entries, tiles.columns,
-            self._slots, self._label_start, slot_start, self._weights, reached, sums,
-        )  # fmt: skip
+        launch_on_tiles(kernels.lift, tiles, self._slots, self._label_start, slot_start, self._weights, reached, sums)
         used = sums.nonzero()[:, 0]  # Of these slots, their tile, entry, and number among the slots of the entry:
         tile = torch.searchsorted(slot_start, used, right=True) - 1
         within = used - slot_start[tile]
@@ -138,10 +135,7 @@ class GPUObservation(Observation):
             super().vote(total, sign=sign)
             return
         label_votes = RowTensors.of(self.evidence.votes, total.device)
-        launch(
-            kernels.add_votes, -(-len(self.pairs.ids) // 128), 128, total, *self.pairs, self.own_votes, *label_votes,
-            sign,
-        )  # fmt: skip
+        launch_each(kernels.add_votes, len(self.pairs.ids), total, *self.pairs, self.own_votes, *label_votes, sign)
 
     def votes_by_label(self) -> np.ndarray:
         """Sum of the votes of each label, (L,) float64."""
@@ -165,10 +159,9 @@ class GPUObservation(Observation):
         logs = torch.zeros(self._slots.shape, device=device)
         left_over = torch.zeros(len(present), dtype=torch.int64, device=device)
         sums = torch.zeros(len(likelihood), dtype=torch.int64, device=device)
-        launch(
-            kernels.share, len(self._slots), THREADS, tiles.table, tiles.start, tiles.entries, tiles.columns,
-            self._slots, self._label_start, self._slot_start, self._weights, self._pair, likelihood,
-            of_labels[present], logs, left_over, sums,
+        launch_on_tiles(
+            kernels.share, tiles, self._slots, self._label_start, self._slot_start, self._weights, self._pair,
+            likelihood, of_labels[present], logs, left_over, sums,
         )  # fmt: skip
         pairs = (sums.double() / UNITS).float()
         of_rest = _px_by_label(left_over, present, len(rest))

@@ -17,7 +17,7 @@ from gsseg_core.raster.cpu.projection import footprints
 from gsseg_core.raster.cpu.splat import LOG_OPACITY
 from gsseg_core.raster.cpu.tiling import Tiles, stride_of
 from gsseg_core.raster.gpu import blending
-from gsseg_core.raster.gpu.device import find_gpu, launch, on_device, to_cpu
+from gsseg_core.raster.gpu.device import find_gpu, launch_each, on_device, to_cpu
 from gsseg_core.raster.gpu.gpu_observation import GPUObservation
 from gsseg_core.raster.gpu.objects_alone import GPUObjects
 from gsseg_core.raster.gpu.projection import TileTensors, project
@@ -112,10 +112,8 @@ class GPUOperator(ViewOperator):
         left_over = codes.new_empty((tiles.height, tiles.width))
         for k in range(0, padded.shape[1], at_once):
             part = padded[:, k : k + at_once].contiguous()
-            launch(
-                blending.blend_kernel(at_once), tiles.columns * tiles.rows, blending.THREADS, tiles.table, tiles.start,
-                tiles.entries, part, tiles.columns, image[k : k + at_once], left_over,
-            )  # fmt: skip
+            kernel = blending.blend_kernel(at_once)
+            blending.launch_on_tiles(kernel, tiles, part, image[k : k + at_once], left_over)
         return image[:channels], left_over
 
     def _adjoint(self, residual: np.ndarray) -> np.ndarray:
@@ -126,12 +124,9 @@ class GPUOperator(ViewOperator):
         for k in range(0, channels, at_once):
             part = values[..., k : k + at_once]
             of_part = torch.empty((len(tiles.ids), at_once), device=self._device)
-            launch(
-                blending.carry_back, tiles.columns * tiles.rows, blending.THREADS, tiles.table, tiles.start,
-                tiles.entries, tiles.place, tiles.columns,
-                torch.nn.functional.pad(part, (0, at_once - part.shape[2])).contiguous(), sums,
-            )  # fmt: skip
-            launch(blending.add_up, -(-len(of_part) // 128), 128, tiles.gaussian_start, sums, of_part)
+            padded = torch.nn.functional.pad(part, (0, at_once - part.shape[2])).contiguous()
+            blending.launch_on_tiles(blending.carry_back, tiles, tiles.place, padded, sums)
+            launch_each(blending.add_up, len(of_part), tiles.gaussian_start, sums, of_part)
             carried[:, k : k + at_once] = of_part[:, : part.shape[2]]
         out = np.zeros((self.num_gaussians, channels), np.float32)
         out[self.ids] = to_cpu(carried)

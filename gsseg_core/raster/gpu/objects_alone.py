@@ -22,10 +22,11 @@ from gsseg_core.raster.gpu.blending import (
     THREADS,
     alpha_of,
     centre_of,
+    launch_on_tiles,
     load_batch,
     own_pixel,
 )
-from gsseg_core.raster.gpu.device import called_by_kernels, cuda, gpu_kernel, launch, on_device, to_cpu
+from gsseg_core.raster.gpu.device import called_by_kernels, cuda, gpu_kernel, on_device, to_cpu
 from gsseg_core.raster.gpu.label_sharing import add_units
 from gsseg_core.raster.gpu.projection import TileTensors
 from gsseg_core.raster.gpu.tensors import starts
@@ -79,10 +80,7 @@ class GPUObjects(ObjectsAlone):
         """Have a kernel sum up by Gaussian over the pixels of all tiles, (M,) float64, in px."""
         tiles, sums = self.tiles, torch.zeros(len(self.labels), dtype=torch.int64, device=self.labels.device)
         there = (on_device(array, sums.device) for array in arrays)
-        launch(
-            kernel, tiles.columns * tiles.rows, THREADS, tiles.table, tiles.start, tiles.entries, tiles.columns,
-            self.labels, *there, sums,
-        )  # fmt: skip
+        launch_on_tiles(kernel, tiles, self.labels, *there, sums)
         return np.asarray(to_cpu(sums) / UNITS)
 
 

@@ -16,15 +16,11 @@ from gsseg_core.raster.constants import DILATION, NEAR
 from gsseg_core.raster.cpu.projection import HALF_LOG2E, LARGEST_REACH, REACH_MAX, ROOT, Pinhole
 from gsseg_core.raster.cpu.splat import HEIGHT, LOG_ALPHA_MIN, LOG_OPACITY, SHEAR, WIDTH, X_TURN, Y_REACH, U, V
 from gsseg_core.raster.cpu.tiling import TILE, check_entries
-from gsseg_core.raster.gpu.device import called_by_kernels, cuda, gpu_kernel, launch, on_device
+from gsseg_core.raster.gpu.device import called_by_kernels, cuda, gpu_kernel, launch_each, on_device
 from gsseg_core.raster.gpu.tensors import starts
 from gsseg_core.scene.camera import Camera
 from gsseg_core.scene.gaussian_scene import GaussianScene
 from gsseg_core.scene.scene_cache import PerScene
-
-THREADS = 128  # Gaussians that one block of threads projects
-
-_CUT = float(LOG_ALPHA_MIN)
 
 
 class SceneTensors(NamedTuple):
@@ -74,7 +70,7 @@ def project(scene: GaussianScene, camera: Camera, device: torch.device) -> TileT
     depth = torch.empty(count, dtype=torch.float32, device=device)
     touched = torch.empty(count, dtype=torch.int32, device=device)
     lens = on_device(_lens_of(camera), device)
-    launch(_project, -(-count // THREADS), THREADS, *tensors, lens, columns, rows, table, depth, touched)
+    launch_each(_project, count, *tensors, lens, columns, rows, table, depth, touched)
 
     seen = touched.nonzero()[:, 0]
     seen = seen[_nearest_first(depth[seen], table, seen)]
@@ -86,7 +82,7 @@ def project(scene: GaussianScene, camera: Camera, device: torch.device) -> TileT
     small = torch.int16 if columns * rows < 1 << 15 else torch.int32
     tiles = torch.empty(total, dtype=small, device=device)
     owners = torch.empty(total, dtype=torch.int32, device=device)
-    launch(_list, -(-len(seen) // THREADS), THREADS, table, gaussian_start, columns, rows, tiles, owners)
+    launch_each(_list, len(seen), table, gaussian_start, columns, rows, tiles, owners)
     tiles, place = torch.sort(tiles, stable=True)
     start = torch.searchsorted(tiles, torch.arange(columns * rows + 1, dtype=small, device=device))
     return TileTensors(
@@ -190,7 +186,7 @@ def _columns_touched(table: np.ndarray, i: int, row: int, columns: int) -> tuple
     bottom = top + np.float32(TILE - 1)
     if bottom < -table[i, Y_REACH] or top > table[i, Y_REACH]:
         return 0, 0
-    cut, narrowness = table[i, LOG_OPACITY] - np.float32(_CUT), np.float32(1) / table[i, WIDTH]
+    cut, narrowness = table[i, LOG_OPACITY] - np.float32(LOG_ALPHA_MIN), np.float32(1) / table[i, WIDTH]
     # The outline x(dy) is concave on the right and convex on the left: its extremes in the band are at the turning
     # points or the ends.
     dy = min(max(table[i, X_TURN], top), bottom)
