@@ -160,18 +160,23 @@ def matrix_from_transform(transform: Transform, topic: str) -> npt.NDArray[np.fl
     return _matrix(transform.translation, transform.rotation, topic)
 
 
-def array_from_point(point: Point) -> npt.NDArray[np.float64]:
-    """Turn a point into an array (3,)."""
+def array_from_point(point: Point | Vector3) -> npt.NDArray[np.float64]:
+    """Turn a point, or a vector, into an array (3,)."""
     return np.array([point.x, point.y, point.z])
+
+
+def xyz(
+    values: npt.NDArray[np.floating[Any]],  # (3,)
+) -> dict[str, float]:
+    """Write an array as the fields of a point or a vector."""
+    return dict(zip("xyz", values.tolist(), strict=True))
 
 
 def pose_from_matrix(
     matrix: npt.NDArray[np.float64],  # (4, 4)
 ) -> Pose:
     """Turn a rigid motion (4, 4), in metres, into a pose."""
-    x, y, z = matrix[:3, 3].tolist()
-    qx, qy, qz, qw = quaternion_from_rotation(matrix[:3, :3])
-    return Pose(position=Point(x=x, y=y, z=z), orientation=Quaternion(x=qx, y=qy, z=qz, w=qw))
+    return Pose(position=Point(**xyz(matrix[:3, 3])), orientation=_quaternion(matrix[:3, :3]))
 
 
 def transform_of(
@@ -179,9 +184,7 @@ def transform_of(
     translation: npt.NDArray[np.float64],  # (3,), in metres
 ) -> Transform:
     """Turn a rotation and a translation into a transform."""
-    pose = pose_from_matrix(rigid_motion(rotation, translation))
-    place = pose.position
-    return Transform(translation=Vector3(x=place.x, y=place.y, z=place.z), rotation=pose.orientation)
+    return Transform(translation=Vector3(**xyz(translation)), rotation=_quaternion(rotation))
 
 
 def viewpoint_messages(
@@ -280,6 +283,11 @@ def byte_array(*parts: npt.NDArray[Any], kind: str = "B") -> array.array[int]:
     for values in parts:
         data.frombytes(np.ascontiguousarray(values).view(np.uint8).data if values.size else b"")
     return data
+
+
+def _quaternion(rotation: npt.NDArray[np.float64]) -> Quaternion:  # (3, 3)
+    x, y, z, w = quaternion_from_rotation(rotation)
+    return Quaternion(x=x, y=y, z=z, w=w)
 
 
 def _matrix(position: Any, orientation: Any, topic: str) -> npt.NDArray[np.float64]:

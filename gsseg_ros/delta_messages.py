@@ -13,7 +13,7 @@ from gsseg_core.errors import GssegError
 from gsseg_core.scene.gaussian_scene import GaussianScene
 from gsseg_core.scene.scene_delta import MAX_ID, GroupMove, SceneDelta
 from gsseg_core.scene.similarity import Similarity
-from gsseg_ros.conversions import transform_of
+from gsseg_ros.conversions import array_from_point, transform_of
 from gsseg_ros.errors import InvalidRequestError
 from gsseg_ros.frames import rotation_from_quaternion
 
@@ -83,7 +83,7 @@ def _added(message: SceneDeltaMessage, count: int) -> GaussianScene | None:
 
 
 def _move(message: GroupMoveMessage) -> GroupMove:
-    turn, shift = message.motion.rotation, message.motion.translation
+    turn = message.motion.rotation
     quaternion = turn.x, turn.y, turn.z, turn.w
     length = math.hypot(*quaternion)
     if not 0 < length < np.inf or message.group > MAX_ID:
@@ -91,6 +91,6 @@ def _move(message: GroupMoveMessage) -> GroupMove:
             f"scene delta: group {message.group} moves by a quaternion of length {length:g}; expected one of length 1, "
             f"and a group of at most {MAX_ID}"
         )
-    rotation, translation = rotation_from_quaternion(*quaternion), np.array([shift.x, shift.y, shift.z])
+    rotation, translation = rotation_from_quaternion(*quaternion), array_from_point(message.motion.translation)
     motion = Similarity(message.scale or 1.0, rotation, translation)
     return GroupMove(message.group, motion, tuple(message.views))

@@ -14,7 +14,7 @@ from visualization_msgs.msg import Marker, MarkerArray
 
 from gsseg_core.objects.oriented_boxes import OrientedBox
 from gsseg_core.scene.camera import rigid_motion
-from gsseg_ros.conversions import matrix_from_pose, pose_from_matrix
+from gsseg_ros.conversions import array_from_point, matrix_from_pose, pose_from_matrix, xyz
 
 BOX_ALPHA, TEXT_SHARE, TEXT_RANGE = 0.35, 0.3, (0.03, 0.3)
 """How opaque a marker's box is; height of its name as a share of the box's middle side, and within which bounds [m]."""
@@ -38,7 +38,7 @@ def object_message(
         num_gaussians=len(confidence),
         confidence=float(confidence.mean(dtype=np.float64)),
         box_pose=pose_from_matrix(rigid_motion(box.axes, box.center)),
-        box_size=Vector3(**_xyz(box.size)),
+        box_size=Vector3(**xyz(box.size)),
         center=point_message(box.mean),
         covariance=box.covariance.ravel(),
     )
@@ -56,20 +56,15 @@ def point_message(
     values: npt.NDArray[np.floating[Any]],  # (3,)
 ) -> Point:
     """Turn an array (3,) into a point."""
-    return Point(**_xyz(values))
+    return Point(**xyz(values))
 
 
 def box_from_object(message: Object) -> OrientedBox:
     """Read the box of an object, in the frame and the metres of the message. Raises `PoseError`: its pose is none."""
-    pose, size, center = message.box_pose, message.box_size, message.center
-    matrix = matrix_from_pose(pose, f"object '{message.name}': box_pose")
-    return OrientedBox(
-        matrix[:3, 3],
-        matrix[:3, :3],
-        np.array([size.x, size.y, size.z]),
-        np.array([center.x, center.y, center.z]),
-        np.array(message.covariance, np.float64).reshape(3, 3),
-    )
+    matrix = matrix_from_pose(message.box_pose, f"object '{message.name}': box_pose")
+    size, center = array_from_point(message.box_size), array_from_point(message.center)
+    covariance = np.array(message.covariance, np.float64).reshape(3, 3)
+    return OrientedBox(matrix[:3, 3], matrix[:3, :3], size, center, covariance)
 
 
 def object_markers(objects: ObjectArray) -> MarkerArray:
@@ -98,9 +93,3 @@ def _reach_up(thing: Object) -> float:
     """How far the box reaches along z of the map, which is up (REP 103), from its middle [m]."""
     box = box_from_object(thing)
     return float(np.abs(box.axes[2]) @ box.size / 2)
-
-
-def _xyz(
-    values: npt.NDArray[np.floating[Any]],  # (3,)
-) -> dict[str, float]:
-    return dict(zip("xyz", values.tolist(), strict=True))

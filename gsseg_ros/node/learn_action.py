@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable
 from typing import Any
 
 from gsseg_msgs.action import Learn
@@ -20,7 +19,6 @@ from gsseg_core.refine.settings import UNREFINED
 from gsseg_ros.errors import CanceledError, InvalidRequestError, NotActiveError, error_code, kind_of
 from gsseg_ros.node.diagnostics import renamed_ids_of
 from gsseg_ros.node.jobs import Job
-from gsseg_ros.node.outputs import Outputs
 from gsseg_ros.node.reports import Selection, finish, report_message
 from gsseg_ros.node.services import Services, explain
 from gsseg_ros.node.workspace import Run
@@ -42,8 +40,8 @@ class LearnAction:
     learnt nothing; objects of ids per-view that it had repaired by then stay so, and are shown as after a view.
     """
 
-    def __init__(self, services: Services, outputs: Callable[[], Outputs]) -> None:
-        self._services, self._workspace, self._outputs = services, services.workspace, outputs
+    def __init__(self, services: Services) -> None:
+        self._services, self._workspace = services, services.workspace
         self._server = ActionServer(
             services.node, Learn, "~/learn", self._execute, goal_callback=self._welcome,
             cancel_callback=lambda goal: CancelResponse.ACCEPT, callback_group=ReentrantCallbackGroup(),
@@ -133,7 +131,7 @@ class LearnAction:
         selection = Selection(session, raw, sorted(raw.class_names), 0.0, settings.scene_to_map)
         with run.watch.stage("boxes"):
             header = Header(stamp=run.stamp, frame_id=settings.map_frame)
-            objects, outputs = selection.objects(header, run.revision), self._outputs()
+            objects, outputs = selection.objects(header, run.revision), self._services.outputs()
         with outputs.turn(run.revision, lambda: self._workspace.holds(run)) as newest:
             if newest:
                 outputs.publish_objects(objects)

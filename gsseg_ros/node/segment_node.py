@@ -93,7 +93,7 @@ class SegmentNode(LifecycleNode):
             self, self.workspace, self._complaints, self._require_outputs, self._lookup, self._show_change
         )
         self._changes = SceneChanges(self._requests, self._await_fused)
-        self._learn = LearnAction(self._requests, self._require_outputs)
+        self._learn = LearnAction(self._requests)
         self._diagnostics = self.create_publisher(DiagnosticArray, "/diagnostics", 10)
         self._sim_time = SimTime(self)
         # In a group of its own, since it may wait for the session. That /clock does not come, it may have to tell.

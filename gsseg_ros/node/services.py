@@ -125,7 +125,7 @@ class Services:
     ) -> None:
         self.node, self.workspace, self.complaints, self.show = node, workspace, complaints, show
         self.turns = Turns(AT_WORK, WAITING)
-        self._outputs, self._lookup = outputs, lookup
+        self.outputs, self._lookup = outputs, lookup
         # Reentrant: a request must not wait for another one to be answered.
         group = ReentrantCallbackGroup()
         for interface, name, handler in (
@@ -144,7 +144,7 @@ class Services:
     @in_turn
     def segment(self, request: Segment.Request, response: Segment.Response) -> None:
         """Segment the scene, answer with what was asked for, and publish all classes, unless that is not wanted."""
-        outputs = self._outputs()
+        outputs = self.outputs()
         with self.workspace.run("segment") as run:
             overlay, version = Image(), self.workspace.session.version
             selection, refine = self._select(request, run)
@@ -353,7 +353,7 @@ class Services:
         workspace, session = self.workspace, self.workspace.loaded
         workspace.number(run)
         names = {} if session is None else session.class_names
-        self._outputs().clear(empty_report(run, session, workspace.settings.map_frame), names)
+        self.outputs().clear(empty_report(run, session, workspace.settings.map_frame), names)
 
     def _header(self, run: Run) -> Header:
         return Header(stamp=run.stamp, frame_id=self.workspace.settings.map_frame)
