@@ -20,14 +20,7 @@ DISTANCE = 4.5  # m from there to the middle
 
 
 def build_garden(
-    count: int = 3_000_000,
-    *,
-    num_classes: int = 20,
-    num_views: int = 200,
-    width: int = 1600,
-    height: int = 1064,
-    sh_degree: int = 3,
-    seed: int = 0,
+    count: int, *, num_classes: int, num_views: int, width: int, height: int, sh_degree: int, seed: int
 ) -> Room:
     """Build a garden with `num_classes` - 1 objects in its middle; all else is background."""
     rng = np.random.default_rng(seed)

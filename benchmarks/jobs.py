@@ -43,11 +43,11 @@ def room(folder: str, size: dict[str, int], wrong: bool = False) -> float:
     return once(lambda: write_room(Path(folder), RoomSize(**size), wrong=wrong))
 
 
-def stages(folder: str, runs: int, sampled: int, labels: str = "labels") -> dict[str, list[float]]:
+def stages(folder: str, runs: int, sampled: int) -> dict[str, list[float]]:
     """Time each stage on a dataset."""
     keep_freed_memory()  # as the command and the node do
     warm_up()
-    return measure_stages(Path(folder), runs, sampled, labels)
+    return measure_stages(Path(folder), runs, sampled)
 
 
 def command(folder: str, labels: str, out: str) -> dict[str, Any]:

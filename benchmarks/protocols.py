@@ -9,7 +9,7 @@ from __future__ import annotations
 import json
 import os
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import NamedTuple
 
@@ -20,7 +20,7 @@ from gsseg_core.data.view import View
 from gsseg_core.errors import CameraFileError, MaskFormatError, MaskSizeError
 from gsseg_core.files.input_files import open_image
 from gsseg_core.metrics import Evaluation
-from gsseg_core.scene.camera import Camera
+from gsseg_core.scene.camera import Camera, resized_camera
 
 ASPECT_TOLERANCE = 0.01
 """How far the aspect ratio of a mask may be from its camera's, as a share: sizes are rounded when images are halved."""
@@ -204,7 +204,7 @@ def resized(camera: Camera, width: int, height: int) -> Camera:
             f"camera '{camera.name}': mask is {width} x {height} pixels; expected the shape of its image, "
             f"{camera.width} x {camera.height}"
         )
-    return replace(camera, width=width, height=height, K=np.diag([across, down, 1.0]) @ camera.K)
+    return resized_camera(camera, width, height)
 
 
 def _image_stems(folder: Path, masks: Sequence[Path], cameras: Sequence[Camera]) -> list[str]:

@@ -194,12 +194,12 @@ class Day:
         (save_state, 3), (reset, 2), (segment, 5), (learn, 3), (cancel, 3),
     )  # fmt: skip
 
-    def pass_time(self, seconds: float, pause: float = 4.0) -> None:
+    def pass_time(self, seconds: float) -> None:
         """Let things happen for so long."""
         end, told = time.monotonic() + seconds, time.monotonic()
         events, weights = zip(*self.EVENTS, strict=True)
         while time.monotonic() < end:
-            self._wait(self._rng.uniform(0.1, 2 * pause))
+            self._wait(self._rng.uniform(0.1, 8.0))
             (event,) = self._rng.choices(events, weights)
             self.found.done[event.__name__] += 1
             try:

@@ -34,12 +34,12 @@ Times = dict[str, list[float]]
 """Seconds of each run of each stage, or other numbers of it."""
 
 
-def measure_stages(folder: Path, runs: int, sampled: int, labels: str = "labels") -> Times:
+def measure_stages(folder: Path, runs: int, sampled: int) -> Times:
     """Time everything on a dataset; what belongs to one view is averaged over some of them."""
     path = folder / "scene.ply"
     times: Times = {"load": timed(lambda: GaussianScene.load(path), runs)}
     times["load, from disk"] = [_from_disk(path) for _ in range(runs)]
-    scene, data = GaussianScene.load(path), Dataset(folder, labels)
+    scene, data = GaussianScene.load(path), Dataset(folder)
     chosen = spread([view for view in data.views("train") if view.has_mask], sampled)
     if not chosen:  # A scene without masks can be rendered all the same.
         chosen = [_unlabelled(view) for view in spread(data.views("all"), sampled)]
