@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import json
 import os
+from collections.abc import Mapping
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
 
 from gsseg_core.errors import GssegError
 from gsseg_core.files.atomic import write_atomically
@@ -34,6 +36,22 @@ def read_object(path: Path, error: type[GssegError], expected: str, within: Path
     if not isinstance(content, dict):
         raise error(f"{path}: holds {kind_of(content)}; expected {expected}")
     return content
+
+
+@dataclass(frozen=True)
+class JsonObject:
+    """A JSON object of a file; messages about its fields begin with `where` it stands."""
+
+    error: ClassVar[type[GssegError]]  # raised where a field is missing, or is something else than is expected
+
+    where: str
+    fields: Mapping[str, Any]
+
+    def value(self, key: str) -> Any:
+        """Read a field."""
+        if key not in self.fields:
+            raise self.error(f"{self.where}: lacks '{key}' (has {clipped(', '.join(self.fields)) or 'nothing'})")
+        return self.fields[key]
 
 
 def kind_of(content: object) -> str:

@@ -3,28 +3,25 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
 from pathlib import Path, PureWindowsPath
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 import numpy.typing as npt
 
 from gsseg_core.errors import CameraFileError, IntrinsicsError, PoseError
 from gsseg_core.files.input_files import IMAGE_SUFFIXES
-from gsseg_core.files.json_files import kind_of
+from gsseg_core.files.json_files import JsonObject, kind_of
 from gsseg_core.scene.camera import Camera, rigid_motion, undistorted_camera
 from gsseg_core.scene.lens import Lens, LensModel, Projection
 from gsseg_core.scene.undistortion import undistortions
 from gsseg_core.text import clipped, composed, quoted
 
 
-@dataclass(frozen=True)
-class Entry:
-    """One camera or image of a file, as a JSON object; messages about it begin with `where` it stands."""
+class Entry(JsonObject):
+    """One camera or image of a file."""
 
-    where: str
-    fields: dict[str, Any]
+    error = CameraFileError
 
     def __contains__(self, key: str) -> bool:
         """Whether there is such a field."""
@@ -43,7 +40,7 @@ class Entry:
 
     def array(self, key: str, *shapes: tuple[int, ...]) -> npt.NDArray[np.float64]:
         """Read numbers in one of some shapes."""
-        value = self._value(key)
+        value = self.value(key)
         try:
             array = np.array(value, np.float64)
         except (TypeError, ValueError, OverflowError):
@@ -55,15 +52,10 @@ class Entry:
 
     def stem(self, key: str) -> str:
         """Read the name of an image, and give its stem; see `stem_of`."""
-        name = self._value(key)
+        name = self.value(key)
         if not isinstance(name, str) or not stem_of(name):
             raise CameraFileError(f"{self.where}: '{key}' is {quoted(name)}; expected the name of an image")
         return stem_of(name)
-
-    def _value(self, key: str) -> Any:
-        if key not in self.fields:
-            raise CameraFileError(f"{self.where}: lacks '{key}' (has {clipped(', '.join(self.fields)) or 'nothing'})")
-        return self.fields[key]
 
 
 def entries(path: Path, content: object, expected: str) -> list[Entry]:

@@ -2,39 +2,26 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
-from dataclasses import dataclass
-from typing import Any
+from collections.abc import Iterator
 
 from gsseg_core.data.mask_formats.masks import check_id, check_name
 from gsseg_core.errors import MaskFormatError
 from gsseg_core.files.input_files import check_pixels
-from gsseg_core.files.json_files import kind_of
+from gsseg_core.files.json_files import JsonObject, kind_of
 from gsseg_core.text import clipped
 
 
-@dataclass(frozen=True)
-class Record:
-    """A JSON object of a mask file; messages about it begin with `where` it stands."""
+class Record(JsonObject):
+    """A JSON object of a mask file."""
 
-    where: str
-    fields: Mapping[str, Any]
+    error = MaskFormatError
 
     @classmethod
     def of(cls, value: object, where: str) -> Record:
-        """Check that something is an object.
-
-        Every method raises `MaskFormatError` where it finds something else than is expected.
-        """
+        """Check that something is an object; raises `MaskFormatError`, as every method does, if it is none."""
         if not isinstance(value, dict):
             raise MaskFormatError(f"{where}: is {kind_of(value)}; expected an object")
         return cls(where, value)
-
-    def value(self, key: str) -> Any:
-        """Read a field."""
-        if key not in self.fields:
-            raise MaskFormatError(f"{self.where}: lacks '{key}' (has {clipped(', '.join(self.fields)) or 'nothing'})")
-        return self.fields[key]
 
     def records(self, key: str, what: str) -> Iterator[Record]:
         """Read a list of objects one by one, each of which messages call a `what`."""
