@@ -14,7 +14,6 @@ from gsseg_core.data.class_names import check_same_names, names_together
 from gsseg_core.data.view import View
 from gsseg_core.errors import StateFileError, StateMismatchError
 from gsseg_core.learn.learner_state import OBJECTS_OF_ONE_SESSION, State
-from gsseg_core.scene.group_frames import is_same
 from gsseg_core.scene.living_scene import LivingScene
 
 
@@ -107,10 +106,7 @@ def _is_same_map(one: LivingScene | None, other: LivingScene | None) -> bool:
     if one is None or other is None or one is other:
         return one is other
     return (
-        np.array_equal(one.ids, other.ids)
-        and np.array_equal(one.groups, other.groups)
-        and one.frames.keys() == other.frames.keys()
-        and all(is_same(frame, other.frames[group]) for group, frame in one.frames.items())
+        np.array_equal(one.ids, other.ids) and np.array_equal(one.groups, other.groups) and one.frames == other.frames
     )
 
 

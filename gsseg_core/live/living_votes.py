@@ -20,7 +20,7 @@ from gsseg_core.raster.backends import make_operator
 from gsseg_core.raster.cpu.occlusion import ray_ends
 from gsseg_core.raster.view_operator import ViewOperator
 from gsseg_core.raster.vote_total import VoteTotal
-from gsseg_core.scene.group_frames import IDENTITY, is_identity
+from gsseg_core.scene.group_frames import IDENTITY
 from gsseg_core.scene.living_scene import LivingScene
 from gsseg_core.spatial.row_order import along_curve
 
@@ -48,7 +48,7 @@ class LivingVotes(VoteLearner):
         if view.group is None:
             return view
         frame = self.living.frame(view.group)
-        return replace(view, camera=view.camera if is_identity(frame) else frame.camera(view.camera), group=None)
+        return replace(view, camera=view.camera if frame == IDENTITY else frame.camera(view.camera), group=None)
 
     def change(self, change: SceneChange, joining: Mapping[str, int | None], *, all_kept: bool = False) -> list[str]:
         """Go over to the scene after a change, with the votes that views have in that: their masks are `View.held`.
@@ -104,7 +104,7 @@ class LivingVotes(VoteLearner):
             return view
         camera = self.in_scene(view).camera
         frame = IDENTITY if group is None else self.living.frames.get(group, IDENTITY)
-        return replace(view, camera=camera if is_identity(frame) else frame.inverse().camera(camera), group=group)
+        return replace(view, camera=camera if frame == IDENTITY else frame.inverse().camera(camera), group=group)
 
     def _looks_alike(self, name: str, view: View) -> bool:
         """Whether a view that belongs to another group now has the votes that it had, bit for bit."""

@@ -14,7 +14,7 @@ import numpy as np
 from gsseg_core.csr_rows import CSRRows
 from gsseg_core.data.view import View
 from gsseg_core.raster.cpu.occlusion import nearest_depths
-from gsseg_core.scene.group_frames import is_same, relation
+from gsseg_core.scene.group_frames import relation
 from gsseg_core.scene.living_scene import LivingScene
 
 _MARGIN = 1 + 1e-5
@@ -90,7 +90,7 @@ class SceneChange:
                 other
                 for other, frame in before.frames.items()
                 if other not in after.frames
-                or not is_same(relation(before.frame(group), frame), relation(after.frame(group), after.frame(other)))
+                or relation(before.frame(group), frame) != relation(after.frame(group), after.frame(other))
             ]
             gone, new = self._gone, self._new
             self._parts[group] = (

@@ -22,25 +22,11 @@ from gsseg_core.scene.vertices import MEANS, QUATS, SCALES, chosen, columns, put
 IDENTITY = Similarity()  # the frame of the scene, and of a group that has not moved
 
 
-def is_identity(frame: Similarity) -> bool:
-    """Whether a frame is that of the scene, exactly."""
-    return is_same(frame, IDENTITY)
-
-
 def relation(to: Similarity, frame: Similarity) -> Similarity:
-    """How a frame lies in another one; `IDENTITY` itself if they are the same, bit for bit."""
-    if is_same(to, frame):
+    """How a frame lies in another one; `IDENTITY` itself if they are the same."""
+    if to == frame:
         return IDENTITY
-    return frame if is_identity(to) else to.inverse().after(frame)
-
-
-def is_same(one: Similarity, other: Similarity) -> bool:
-    """Whether two frames, or relations, are the same, bit for bit."""
-    return one is other or (
-        one.scale == other.scale
-        and np.array_equal(one.rotation, other.rotation)
-        and np.array_equal(one.translation, other.translation)
-    )
+    return frame if to == IDENTITY else to.inverse().after(frame)
 
 
 def moved_geometry(scene: GaussianScene, which: npt.NDArray[np.bool_], frame: Similarity) -> GaussianScene:  # (N,)

@@ -21,7 +21,7 @@ from gsseg_core.files.input_files import UnfitError
 from gsseg_core.files.json_files import whole_number
 from gsseg_core.files.npz_files import NpzArrays
 from gsseg_core.scene.gaussian_scene import ACTIVATED, GaussianScene
-from gsseg_core.scene.group_frames import IDENTITY, is_identity, joined, moved_geometry, moved_scene, relation
+from gsseg_core.scene.group_frames import IDENTITY, joined, moved_geometry, moved_scene, relation
 from gsseg_core.scene.scene_delta import MAX_ID, SceneDelta, read_similarity, similarity_entry, straightened
 from gsseg_core.scene.scene_ids import with_ids
 from gsseg_core.scene.similarity import Similarity
@@ -244,7 +244,7 @@ class LivingScene:
         for group in np.unique(groups[changed]).tolist():
             here = changed & (groups == group)
             part = local.subset(here)
-            if not is_identity(frames[group]):
+            if frames[group] != IDENTITY:
                 part = moved_scene(part, frames[group])
             for name, array in arrays.items():
                 array[here] = getattr(part, name)
@@ -253,7 +253,7 @@ class LivingScene:
 
 def _are_far(groups: npt.NDArray[np.int64], frames: Mapping[int, Similarity]) -> npt.NDArray[np.bool_]:  # (N,)
     """Mark the Gaussians of groups that are not where they were given, (N,)."""
-    return np.isin(groups, [group for group, frame in frames.items() if not is_identity(frame)])
+    return np.isin(groups, [group for group, frame in frames.items() if frame != IDENTITY])
 
 
 def _colourless(geometry: npt.NDArray[np.float32]) -> GaussianScene:  # (N, 11)

@@ -29,6 +29,15 @@ class Similarity:
     rotation: npt.NDArray[np.float64] = field(default_factory=lambda: np.eye(3))  # (3, 3)
     translation: npt.NDArray[np.float64] = field(default_factory=lambda: np.zeros(3))  # (3,)
 
+    def __eq__(self, other: object) -> bool:
+        """Whether two are the same, number by number."""
+        return self is other or (
+            isinstance(other, Similarity)
+            and self.scale == other.scale
+            and np.array_equal(self.rotation, other.rotation)
+            and np.array_equal(self.translation, other.translation)
+        )
+
     def points(self, points: npt.NDArray[Any]) -> npt.NDArray[np.float64]:  # (..., 3)
         """Map points (..., 3) from the first frame to the second."""
         return self.scale * (points @ self.rotation.T) + self.translation

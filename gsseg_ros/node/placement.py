@@ -10,7 +10,6 @@ from typing import Any, TypeAlias
 
 from gsseg_core.errors import GssegError
 from gsseg_core.scene.camera import Camera
-from gsseg_core.scene.group_frames import is_same
 from gsseg_ros.frames import Similarity
 
 _Ways: TypeAlias = dict[str, tuple[Similarity, Similarity]]
@@ -43,7 +42,7 @@ class Placement:
             at = self._left | {name: moved[0] for name, moved in self._moved_from.items()}
             moved_from = {name: (at.get(name, before), after) for name in names}
             # To go nowhere costs as much as to go far, and rounds the camera.
-            self._moved_from = {name: ways for name, ways in moved_from.items() if not is_same(*ways)}
+            self._moved_from = {name: (left, to) for name, (left, to) in moved_from.items() if left != to}
             self._left = {}
             self._begin()
 

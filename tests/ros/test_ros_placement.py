@@ -31,7 +31,6 @@ from gsseg_core.live.living_session import LivingSession
 from gsseg_core.live.per_view_session import PerViewSession
 from gsseg_core.refine.settings import UNREFINED
 from gsseg_core.scene.gaussian_scene import GaussianScene
-from gsseg_core.scene.group_frames import is_same
 from gsseg_core.scene.scene_delta import GroupMove, SceneDelta
 from gsseg_core.scene.similarity import Similarity as CoreSimilarity
 from gsseg_ros.cloud_messages import arrays_from_cloud
@@ -363,7 +362,7 @@ def test_to_grow_and_to_be_put_elsewhere_is_all_or_nothing(
         assert ("not now" if fails == "the place" else "tolerance is -1") in refused.error_msg
         assert not here.node.workspace.placement._moved_from, "views have nowhere to go"
         assert here.node.get_parameter("scene_to_map.scale").value == 1.0
-        assert is_same(here.node.workspace.settings.scene_to_map, IDENTITY)
+        assert here.node.workspace.settings.scene_to_map == IDENTITY
         assert session.living is before and all(now is was for now, was in zip(session.views, views, strict=True))
 
 
