@@ -76,8 +76,9 @@ def test_a_scene_is_copied_to_a_device_once_and_forgotten_with_the_scene() -> No
 
 
 def test_half_of_the_free_memory_of_a_gpu_is_for_prepared_views(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(prepared_views, "free_memory_on", lambda name: {"cuda:1": 10 << 30}[name])
+    monkeypatch.setattr(prepared_views, "free_memory_on", lambda name: {"cuda:1": 10 << 30, "cuda:2": 0}[name])
     assert prepared_views.default_budget("cuda:1") == 5 << 30
+    assert prepared_views.default_budget("cuda:2") == 0, "what is full has no room, rather than the usual"
 
 
 # Where it cannot run
