@@ -82,13 +82,16 @@ class ErrorModel:
         return np.asarray(words @ plausible.T)
 
     @property
-    def by_label(self) -> tuple[np.ndarray, np.ndarray]:
-        """Return C_v by label, (L, K) float32, and the same with zeros for labels that are not informative.
+    def by_label(self) -> np.ndarray:
+        """C_v by label, (L, K) float32."""
+        return np.ascontiguousarray(self.likelihood.T)
+
+    def used(self, by_label: np.ndarray) -> np.ndarray:  # (L, K)
+        """Return C_v by label with zeros for labels that are not informative.
 
         Under such a label all classes are equally likely, so its pixels would change how soon EM ends, but not where.
         """
-        likelihood = np.ascontiguousarray(self.likelihood.T)
-        return likelihood, np.where(self.evidence.informative[:, None], likelihood, np.float32(0))
+        return np.where(self.evidence.informative[:, None], by_label, np.float32(0))
 
     def expected_counts(self, counts: np.ndarray) -> np.ndarray:
         """Return the expected number of pixels (K, W) with each true class and each word seen.

@@ -364,8 +364,8 @@ class EMLearner(Learner):
         codes, backend = rows_on(codes, self.device)
 
         def share(name: str, observation: Observation) -> tuple[ViewPairs, np.ndarray, VoteShares]:
-            (likelihood, used), pairs = models[name].by_label, backend.pairs_of(observation)
-            return pairs, used, backend.shares(observation, codes, pairs, likelihood)
+            likelihood, pairs = models[name].by_label, backend.pairs_of(observation)
+            return pairs, models[name].used(likelihood), backend.shares(observation, codes, pairs, likelihood)
 
         gradient, log_likelihoods = backend.zeros(codes, np.int64), {}
         for name, (pairs, used, shares) in self._of_each(share, models, tick):
@@ -381,9 +381,8 @@ class EMLearner(Learner):
         gradient, prior = (backend.put(array, self.device) for array in (gradient, prior))
 
         def refit(name: str, observation: Observation) -> ErrorModel:
-            model, pairs = models[name], backend.pairs_of(observation)
+            model, likelihood, pairs = models[name], models[name].by_label, backend.pairs_of(observation)
             without = codes_without(observation, model, codes, gradient, prior, self.device)
-            likelihood, _ = model.by_label
             shares = backend.shares(observation, without, backend.by_row(pairs), likelihood)
             counts = backend.confusion_counts(without, pairs, shares.pairs, self.num_classes, len(likelihood))
             counts[0] += shares.rest

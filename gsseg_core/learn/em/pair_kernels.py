@@ -34,8 +34,8 @@ def codes_without(
     which are on the device.
     """
     backend = kernels_on(device)
-    (likelihood, used), pairs = model.by_label, backend.pairs_of(observation)
+    likelihood, pairs = model.by_label, backend.pairs_of(observation)
     shares = backend.shares(observation, codes, pairs, likelihood)
     stepped: CSRRows = backend.rows_like(codes, pairs.ids)
-    backend.m_step_without_view(codes, gradient, prior, pairs, used, shares.pairs, stepped)
+    backend.m_step_without_view(codes, gradient, prior, pairs, model.used(likelihood), shares.pairs, stepped)
     return stepped
