@@ -13,11 +13,10 @@ import numpy as np
 from gsseg_core.kernels.compiler import called_by_kernels, kernel
 from gsseg_core.simd import at_most, load_row
 from gsseg_core.spatial import knn
-from gsseg_core.spatial.kd_tree import LEAF, Tree, leaf_range
-from gsseg_core.spatial.neighbourhood import Found, Neighbours, nodes_without
+from gsseg_core.spatial.kd_tree import LEAF, MIXED, Tree, leaf_range, values_of_nodes
+from gsseg_core.spatial.neighbourhood import Found, Neighbours
 from gsseg_core.spatial.row_order import rows_by_label
 
-MIXED = np.int32(-(2**31))  # stands for the label of a node whose points have several
 NOBODY = np.int32(MIXED + 1)  # the label of no point
 
 
@@ -35,7 +34,7 @@ def class_distances(neighbours: Neighbours, labels: np.ndarray) -> np.ndarray:  
     radii[of_point == 0], found[of_point == 0] = np.nan, np.nan
     # Where all neighbours are of a point's own class, these are what is looked for.
     leaves = len(tree.blocks)
-    of_node = _labels_of_nodes(of_point, leaves)
+    of_node = values_of_nodes(of_point, leaves)
     of_leaf = np.where(of_node[leaves:] == MIXED, NOBODY, of_node[leaves:])
     met = _meet(tree, wanted, neighbours.radii, of_node, of_leaf, of_point, of_point, None)
     found[wanted] = np.where(met, np.nan, neighbours.distances)[wanted]
@@ -64,8 +63,8 @@ def _to_be_found(tree: Tree, labels: np.ndarray, before: Found, k: int) -> np.nd
     wanted |= few
     leaves, asked = len(tree.blocks), (labels > 0) & ~wanted
     # Nodes in which none has moved have nothing to say.
-    still, nothing_moved = nodes_without(moved, leaves), np.ones(leaves, np.int32)
-    return wanted | _meet(tree, asked, before.radii, still, nothing_moved, labels, before.labels, moved)
+    of_node, still = values_of_nodes(moved, leaves), np.zeros(leaves, np.int32)
+    return wanted | _meet(tree, asked, before.radii, of_node, still, labels, before.labels, moved)
 
 
 @kernel(parallel=True)
@@ -118,15 +117,3 @@ def _is_met(
                 elif moved[p] and (labels[p] == label or before[p] == label):
                     return True
     return False
-
-
-@kernel
-def _labels_of_nodes(labels: np.ndarray, leaves: int) -> np.ndarray:
-    """Label that all points of a node have, (2 L,) int32, or `MIXED`."""
-    of_node = np.empty(2 * leaves, np.int32)
-    for leaf in range(leaves):
-        first, last = leaf_range(leaf, leaves, labels.shape[0])
-        of_node[leaves + leaf] = labels[first] if (labels[first:last] == labels[first]).all() else MIXED
-    for node in range(leaves - 1, 0, -1):
-        of_node[node] = of_node[2 * node] if of_node[2 * node] == of_node[2 * node + 1] else MIXED
-    return of_node

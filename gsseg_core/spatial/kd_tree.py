@@ -12,6 +12,7 @@ from gsseg_core.scene.gaussian_scene import GaussianScene
 from gsseg_core.scene.scene_cache import PerScene
 
 LEAF = 16  # most points in a leaf of the tree
+MIXED = np.int32(-(2**31))  # stands for the value of a node whose points have several
 SUBTREE = 8  # levels of a subtree that one thread builds alone: about 4000 points
 
 
@@ -136,6 +137,21 @@ def _leaves(points: np.ndarray, leaves: int) -> tuple[np.ndarray, np.ndarray]:
             boxes[node, d] = min(boxes[2 * node, d], boxes[2 * node + 1, d])
             boxes[node, 3 + d] = max(boxes[2 * node, 3 + d], boxes[2 * node + 1, 3 + d])
     return boxes, blocks
+
+
+@kernel(parallel=True)
+def values_of_nodes(values: np.ndarray, leaves: int) -> np.ndarray:  # (n,) bool or int32, in tree order
+    """Value that all points of a node have, (2 L,) int32, or `MIXED`."""
+    of_node = np.empty(2 * leaves, np.int32)
+    for leaf in nb.prange(leaves):
+        first, last = leaf_range(leaf, leaves, len(values))
+        alike = True
+        for i in range(first + 1, last):
+            alike &= values[i] == values[first]
+        of_node[leaves + leaf] = values[first] if alike else MIXED
+    for node in range(leaves - 1, 0, -1):
+        of_node[node] = of_node[2 * node] if of_node[2 * node] == of_node[2 * node + 1] else MIXED
+    return of_node
 
 
 @nb.njit(inline="always")

@@ -23,7 +23,7 @@ from gsseg_core.scene.gaussian_scene import GaussianScene
 from gsseg_core.scene.scene_cache import PerScene
 from gsseg_core.simd import at_most, count_bits, load_row
 from gsseg_core.spatial import knn
-from gsseg_core.spatial.kd_tree import LEAF, Tree, leaf_range, scaled, tree_of
+from gsseg_core.spatial.kd_tree import LEAF, Tree, leaf_range, scaled, tree_of, values_of_nodes
 from gsseg_core.spatial.leaf_codes import LeafCodes, add_leaf, none_of, take_first
 
 HALF = 3.0
@@ -86,14 +86,14 @@ class Neighbours:
         Rows that are not wanted have no entries either.
         """
         order, leaf_codes = self.tree.order, LeafCodes.build(self.tree, codes, weights, num_classes)
-        empty = nodes_without((weights > 0)[order], len(self.tree.blocks))
+        counted = values_of_nodes((weights > 0)[order], len(self.tree.blocks))
         selected = np.ones(len(order), bool) if wanted is None else wanted[order]
         self.look_for(selected)
         below = np.nextafter(self.radii, np.float32(-np.inf))
         asked, parts = np.flatnonzero(selected).astype(np.int32), []
         for some in slices(len(asked), num_classes):  # of which each has room for rows that are written out in full
             columns, entries = average(
-                self.tree, leaf_codes, empty, self.radii, below, self.k, asked[some], num_classes
+                self.tree, leaf_codes, counted, self.radii, below, self.k, asked[some], num_classes
             )
             parts.append(CSRRows(starts(columns.counts), columns.joined(), entries.joined()))
         means = CSRRows.vstack([*parts, CSRRows.empty(1)])
@@ -133,7 +133,7 @@ def find_neighbours(scene: GaussianScene, k: int) -> None:
 @kernel(parallel=True)
 def average(
     tree: Tree, codes: LeafCodes,
-    empty: np.ndarray,  # (2 L,) int32: 1 for nodes of which no point counts
+    counted: np.ndarray,  # (2 L,) of `values_of_nodes`: 0 for nodes of which no point counts
     radii: np.ndarray, below: np.ndarray,  # (n,): squared distance to the k-th nearest other; the next smaller float32
     k: int,
     places: np.ndarray, num_classes: int,  # (M,) int32, ascending
@@ -157,7 +157,7 @@ def average(
             for q in range(begin, end):
                 reach = max(reach, radii[places[q]])
             # Most of those that no view saw are among their like, and none of these has to be looked at.
-            candidates, found = knn.find_leaves(tree.boxes, box, reach, empty, np.int32(1), candidates)
+            candidates, found = knn.find_leaves(tree.boxes, box, reach, counted, np.int32(0), candidates)
             if found > 0:
                 candidates, found = knn.find_leaves(tree.boxes, box, reach, skip, np.int32(0), candidates)
             for q in range(begin, end if found > 0 else begin):
@@ -205,17 +205,3 @@ def _list_means(
     for j in range(count):
         entries[j] = masses[j] / total
     return count
-
-
-@kernel(parallel=True)
-def nodes_without(counted: np.ndarray, leaves: int) -> np.ndarray:  # (n,) bool, by place
-    """Mark the nodes of which no point counts, (2 L,) int32: 1 for these, 0 for others."""
-    without = np.ones(2 * leaves, np.int32)
-    for leaf in nb.prange(leaves):
-        first, last = leaf_range(leaf, leaves, len(counted))
-        for i in range(first, last):
-            if counted[i]:
-                without[leaves + leaf] = 0
-    for node in range(leaves - 1, 0, -1):
-        without[node] = without[2 * node] & without[2 * node + 1]
-    return without
