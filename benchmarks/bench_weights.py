@@ -15,10 +15,11 @@ from typing import Any
 
 import numba as nb
 import numpy as np
+from jobs import small_room
 from llvmlite import ir
 from machine import asked_anew, describe, parser_of, timed
 from numba.core import types
-from workloads import REAL, RoomSize, make_room, true_labels
+from workloads import REAL, RoomSize
 
 from gsseg_core.data.dataset import Dataset
 from gsseg_core.data.soft_masks import SeenLabels
@@ -50,9 +51,8 @@ def main() -> None:
     options = parser.parse_args()
     print(describe())
     warm_up()
-    built = make_room(RoomSize(options.gaussians, options.views, 10, 640, 480))
-    views = [View.from_arrays(camera, true_labels(built, camera, 10)) for camera in built.cameras]
-    compare("room", built.scene, views, 10, options.runs)
+    room, views, _ = small_room(RoomSize(options.gaussians, options.views, 10, 640, 480))
+    compare("room", room, views, 10, options.runs)
     if (options.data / REAL[0]).is_dir():
         data = Dataset(options.data / REAL[0], "labels_noisy")
         scene = GaussianScene.load(options.data / REAL[0] / "scene.ply")

@@ -13,8 +13,9 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
+from jobs import small_room
 from machine import describe, parser_of
-from workloads import REAL, RoomSize, make_room, true_labels
+from workloads import REAL, RoomSize
 
 from gsseg_core.data.dataset import Dataset
 from gsseg_core.data.view import View, spread
@@ -40,9 +41,8 @@ def main() -> None:
             follow(f"{REAL[0]}, {masks}", scene, data.views("train"), data.num_classes)
     else:
         print(f"skipped: no {options.data / REAL[0]}")
-    built = make_room(RoomSize(options.gaussians, options.views, 10, 640, 480))
-    views = [View.from_arrays(camera, true_labels(built, camera, 10)) for camera in built.cameras]
-    follow("room", built.scene, views, 10)
+    room, views, _ = small_room(RoomSize(options.gaussians, options.views, 10, 640, 480))
+    follow("room", room, views, 10)
 
 
 def follow(name: str, scene: GaussianScene, views: list[View], num_classes: int) -> None:

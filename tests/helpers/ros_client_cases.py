@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import threading
 from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -47,14 +48,24 @@ class Place:
         return Dataset(self.folder / "data").views("all")
 
 
+@contextmanager
+def placed(ros: Ros, folder: Path) -> Iterator[Place]:
+    with SegmentationClient(domain_id=ros.domain, find_timeout=PATIENCE) as client:
+        yield Place(folder, ros, client)
+
+
 @pytest.fixture(name="shared", scope="module")
 def shared_fixture(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Place]:
     folder = tmp_path_factory.mktemp("client")
-    with (
-        private_ros(folder) as ros,
-        SegmentationClient(domain_id=ros.domain, find_timeout=PATIENCE) as client,
-    ):
-        yield Place(folder, ros, client)
+    with private_ros(folder) as ros, placed(ros, folder) as place:
+        yield place
+
+
+@pytest.fixture(name="own")
+def own_fixture(ros: Ros, tmp_path: Path) -> Iterator[Place]:
+    """A place of one test's own, whose node it may stop."""
+    with placed(ros, tmp_path) as place:
+        yield place
 
 
 @pytest.fixture(name="place")

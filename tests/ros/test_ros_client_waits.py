@@ -29,6 +29,7 @@ from ros_client_cases import (  # noqa: F401
     learning_forever,
     learnt_fixture,
     once_free,
+    own_fixture,
     place_fixture,
     says_in_the_end,
     shared_fixture,
@@ -229,50 +230,41 @@ def test_a_node_in_a_namespace_is_found_under_its_name(ros: Ros, tmp_path: Path)
         assert failure(client.segment).name == "NO_CODES"
 
 
-def test_a_node_that_hangs_is_not_waited_for_for_ever(ros: Ros, tmp_path: Path) -> None:
-    write_dataset(tmp_path / "data")
-    node = start_node(ros, tmp_path)
-    with SegmentationClient(domain_id=ros.domain, find_timeout=PATIENCE) as client:
-        client.wait_until_active(PATIENCE)
-        assert failure(client.segment).name == "NO_CODES"
-        node.send(signal.SIGSTOP)
-        with pytest.raises(NodeUnavailableError, match="/gsseg did not answer in time during /gsseg/segment"):
-            client.segment(timeout=0.5)
-        node.send(signal.SIGCONT)
-        assert failure(client.segment).name == "NO_CODES"
+def test_a_node_that_hangs_is_not_waited_for_for_ever(own: Place) -> None:
+    node, client = own.node, own.client
+    assert failure(client.segment).name == "NO_CODES"
+    node.send(signal.SIGSTOP)
+    with pytest.raises(NodeUnavailableError, match="/gsseg did not answer in time during /gsseg/segment"):
+        client.segment(timeout=0.5)
+    node.send(signal.SIGCONT)
+    assert failure(client.segment).name == "NO_CODES"
 
 
-def test_a_node_that_is_asked_to_end_cancels_learning_and_says_so(ros: Ros, tmp_path: Path) -> None:
-    write_dataset(tmp_path / "data")
-    node = start_node(ros, tmp_path)
-    with SegmentationClient(domain_id=ros.domain, find_timeout=PATIENCE) as client:
-        client.wait_until_active(PATIENCE)
-        running = learning_forever(client)
-        node.send(signal.SIGTERM)
-        running.join()
-        assert isinstance(running.error, SegmentationError), (running.error, node.output)
-        assert running.error.name == "CANCELED" and node.wait() == 0
+def test_a_node_that_is_asked_to_end_cancels_learning_and_says_so(own: Place) -> None:
+    node, client = own.node, own.client
+    running = learning_forever(client)
+    node.send(signal.SIGTERM)
+    running.join()
+    assert isinstance(running.error, SegmentationError), (running.error, node.output)
+    assert running.error.name == "CANCELED" and node.wait() == 0
 
 
 def test_learning_ends_with_an_error_where_the_node_was_killed_and_started_anew_meanwhile(
-    ros: Ros, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    own: Place, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(calls, "SILENT_SECONDS", 0.02)  # Less than lies between two messages of feedback.
-    write_dataset(tmp_path / "data")
-    node = start_node(ros, tmp_path)
-    with SegmentationClient(domain_id=ros.domain, find_timeout=PATIENCE) as client:
-        client.wait_until_active(PATIENCE)
-        running = learning_forever(client)
-        (goal,) = client._learning  # While it works, to be asked again does not disturb it.
-        wait_until(lambda: len(goal._questions) > 20 or running.ended, "questions for the result")
-        assert not running.ended, running.error
-        node.kill()
-        start_node(ros, tmp_path)
-        running.join()
-        assert isinstance(running.error, NodeUnavailableError), running.error
-        assert "/gsseg went away during learn" in str(running.error)
-        client.wait_until_active(PATIENCE)  # The new one answers before it is.
-        assert client.learn("data", timeout=PATIENCE).report.num_views == 4
+    node, client = own.node, own.client
+    running = learning_forever(client)
+    (goal,) = client._learning  # While it works, to be asked again does not disturb it.
+    wait_until(lambda: len(goal._questions) > 20 or running.ended, "questions for the result")
+    assert not running.ended, running.error
+    node.kill()
+    start_node(own.ros, own.folder)
+    running.join()
+    assert isinstance(running.error, NodeUnavailableError), running.error
+    assert "/gsseg went away during learn" in str(running.error)
+    client.wait_until_active(PATIENCE)  # The new one answers before it is.
+    assert client.learn("data", timeout=PATIENCE).report.num_views == 4
 
 
 def test_a_service_that_goes_away_unanswered_ends_the_wait(ros: Ros) -> None:
