@@ -96,11 +96,9 @@ class Neighbours:
                 self.tree, leaf_codes, counted, self.radii, below, self.k, asked[some], num_classes
             )
             parts.append(CSRRows(starts(columns.counts), columns.joined(), entries.joined()))
-        means = CSRRows.vstack([*parts, CSRRows.empty(1)])
+        means = CSRRows.vstack([CSRRows.empty(0), *parts])
         del parts, leaf_codes
-        rows = np.full(len(order), len(asked))
-        rows[order[asked]] = np.arange(len(asked))
-        return means.take(rows)
+        return CSRRows.empty(len(order)).replaced_at(order[asked], means)
 
 
 def neighbour_weights(known: np.ndarray, evidence: np.ndarray) -> np.ndarray:  # (N,) bool, (N,) px

@@ -34,7 +34,7 @@ from gsseg_core.raster.objects_alone import ObjectsAlone
 
 _NOTHING = np.float32(0)
 _ALL = np.float32(1)
-_ROUNDING, _DARK = np.float32(ROUNDING), np.float32(T_MIN / TILE)
+_DARK = np.float32(T_MIN / TILE)
 _UNKNOWN = np.int32(-1)
 
 
@@ -133,7 +133,7 @@ def _reasons_to_stay(
             if seen == labels[entries[first + e]]:
                 through *= _ALL - kept[entries[first + e]] * alpha_of(splats, e, x, y)
         cuda.syncthreads()
-    need = through / (_ALL - through + _ROUNDING) if through >= _DARK else _NOTHING
+    need = through / (_ALL - through + ROUNDING) if through >= _DARK else _NOTHING
     for first in range(start[tile], start[tile + 1], BATCH):
         count = load_batch(table, entries, first, start[tile + 1], splats, t)
         cuda.syncthreads()
