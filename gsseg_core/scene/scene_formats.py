@@ -10,7 +10,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from gsseg_core.errors import SceneFileError
-from gsseg_core.files.input_files import open_input
+from gsseg_core.files.input_files import open_input, reason
 from gsseg_core.scene import checkpoint, compressed_ply, gltf, ksplat, ply, ply_variants, sog, splat, spz
 from gsseg_core.scene.vertices import ReadScene
 
@@ -119,13 +119,16 @@ def read_scene(path: str | os.PathLike[str], within: Path | None = None) -> Read
     scene_format = suited or SCENE_FORMATS[0]
     try:
         return scene_format.read(path, within)
-    except SceneFileError as error:
+    except (SceneFileError, OSError) as error:
+        what = str(error)
+        if isinstance(error, OSError):  # of a reader that does not see to that itself
+            what = f"{path}: cannot be read ({reason(error)}); expected a {scene_format.name}"
         formats = ", ".join(f"{known.name} ({known.looked_for})" for known in SCENE_FORMATS)
         known = "" if suited or os.path.isdir(path) else f"; gsseg reads {formats}"
         if known and path.suffix.lower() in (".usd", ".usda", ".usdc"):
             known = "; gsseg writes USD, and does not read it: give the scene that it was made from"
         hint = scene_hint(path) if within is None else ""  # It looks around, wherever links lead.
-        raise SceneFileError(f"{error}{known}{hint}") from error
+        raise SceneFileError(f"{what}{known}{hint}") from error
 
 
 def scene_hint(path: Path) -> str:
