@@ -68,15 +68,15 @@ class ViewerState:
         """
         if mode not in MODES:
             raise SettingsError(f"colour by {mode!r}; expected one of {', '.join(MODES)}")
+        new: dict[str, Any] = {"mode": mode}
         if mode == BY_RELIABILITY and self.model.reliability is None:
             if not self.reliability or not self.views:
                 raise SettingsError(
                     "view reliability is not known; expected --data, and a report.json of `gsseg segment --learner em` "
                     "beside the segmentation"
                 )
-            mean = self.view_votes(progress).mean_reliability(self.reliability)
-            self.change(lambda model: setattr(model, "reliability", mean))
-        self.change(lambda model: setattr(model, "mode", mode))
+            new["reliability"] = self.view_votes(progress).mean_reliability(self.reliability)
+        self.change(lambda model: vars(model).update(new))
 
     def set_level(self, granularity: float, inside: int | None = None) -> None:
         """Show the level of the tree at a granularity: all of it, or only what lies inside one node."""

@@ -2,12 +2,10 @@
 
 from __future__ import annotations
 
-import socket
 import threading
 from collections.abc import Callable, Iterator
-from contextlib import closing, redirect_stdout
+from contextlib import closing
 from dataclasses import replace
-from io import StringIO
 from pathlib import Path
 from typing import Any
 from unittest.mock import MagicMock
@@ -17,12 +15,10 @@ import pytest
 from labellings import labelled, probabilities_of
 from operator_cases import make_scene
 from parts_of_balls import tree_of_balls
-from patience import PATIENCE, wait_until
+from patience import wait_until
 from small_scenes import NAMES, balls_on_a_table, ring
 
 pytest.importorskip("viser")
-
-from viser.infra._infra import WebsockServer
 
 from gsseg_core.csr_rows import CSRRows, largest
 from gsseg_core.export import class_files
@@ -30,13 +26,10 @@ from gsseg_core.scene.camera import Camera
 from gsseg_core.segmentation import Segmentation
 from gsseg_core.viewer import corrections as view_corrections
 from gsseg_core.viewer import model as view_model
-from gsseg_core.viewer import viewer as viewer_module
 from gsseg_core.viewer.access import listen
-from gsseg_core.viewer.clients import SERVER, ClientRenderers
+from gsseg_core.viewer.clients import SERVER
 from gsseg_core.viewer.corrections import disc
-from gsseg_core.viewer.live_source import LiveUpdate
 from gsseg_core.viewer.model import ClassRow, Labelling, ViewModel
-from gsseg_core.viewer.server import start_server
 from gsseg_core.viewer.state import ViewerState
 from gsseg_core.viewer.viewer import Viewer
 
@@ -201,15 +194,6 @@ def test_a_scene_of_one_gaussian_is_looked_at_from_outside() -> None:
         assert start.near > 0 and np.linalg.norm(start.position - start.look_at) > 0.3
 
 
-def test_nothing_is_drawn_for_a_browser_that_left_before_it_was_known() -> None:
-    server, client = MagicMock(), MagicMock()
-    server.get_clients.return_value = {}
-    renderers = ClientRenderers(server, SCENE, SERVER, "cpu")
-    renderers._leave(client)
-    renderers._join(client)
-    assert not renderers.by_client
-
-
 @pytest.mark.parametrize("tool", ["the whole region", "a disc", "all that looks alike there", "a box"])
 def test_a_correction_is_of_the_class_that_was_chosen_though_classes_are_renumbered_meanwhile(
     viewer: Viewer, tool: str, monkeypatch: pytest.MonkeyPatch
@@ -351,51 +335,3 @@ def test_a_class_that_turns_up_leaves_the_buttons_before_it_to_be_pressed() -> N
             orders = [button.order for button in buttons.values()]
             assert orders == sorted(orders)
             before = buttons
-
-
-def test_a_page_that_is_still_open_connects_to_the_next_viewer_once_that_is_made(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    real, listener = WebsockServer.start, listen(port=18310)
-    page = socket.create_connection(("127.0.0.1", listener.port))
-
-    def start(server: WebsockServer) -> None:
-        real(server)
-        asked = {"Host": f"127.0.0.1:{listener.port}", "Upgrade": "websocket", "Connection": "Upgrade"}
-        asked |= {"Sec-WebSocket-Key": "AAAAAAAAAAAAAAAAAAAAAA==", "Sec-WebSocket-Version": "13"}
-        lines = ["GET / HTTP/1.1", *(f"{name}: {value}" for name, value in asked.items()), "", ""]
-        page.sendall("\r\n".join(lines).encode())
-        page.settimeout(0.3)
-        with pytest.raises(TimeoutError):
-            page.recv(1)  # What viser would do with it needs what it has not made yet.
-
-    monkeypatch.setattr(WebsockServer, "start", start)
-    with closing(listener), closing(page):
-        server = start_server(listener)
-        try:
-            page.settimeout(PATIENCE)
-            assert page.recv(12) == b"HTTP/1.1 101"
-        finally:
-            with redirect_stdout(StringIO()):
-                server.stop()
-
-
-def test_to_close_does_not_wait_for_the_answer_of_a_node_that_is_gone(monkeypatch: pytest.MonkeyPatch) -> None:
-    class Source:
-        """Waits until it is closed, and then raises what a closed connection does."""
-
-        def __init__(self) -> None:
-            self.asked, self.closed = threading.Event(), threading.Event()
-
-        def wait(self, timeout: float) -> LiveUpdate | None:
-            self.asked.set()
-            assert self.closed.wait(PATIENCE), "nobody closes it"
-            raise RuntimeError("it is closed")
-
-        def close(self) -> None:
-            self.closed.set()
-
-    monkeypatch.setattr(viewer_module, "SOURCE_SECONDS", 0.01)
-    source = Source()
-    with closing(Viewer(ViewModel(SCENE, LEARNT), source=source, listener=listen(port=18300), draw=SERVER)):
-        assert source.asked.wait(PATIENCE)
