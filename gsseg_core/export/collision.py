@@ -1,7 +1,8 @@
 """Meshes to collide with: what a simulator takes for the solid shape of an object.
 
-All three kinds are made from the object's opaque Gaussians, without floaters as `gsseg_core.objects.oriented_boxes`
-finds them, each an ellipsoid of one standard deviation.
+All three kinds are made from the object's opaque Gaussians whose centres its box contains, which
+`gsseg_core.objects.oriented_boxes` makes: a few that float make it no larger. Each is an ellipsoid of one standard
+deviation.
 
 - The hull is the convex hull of the ends of their axes.
 - The surface is watertight, follows hollows, and has no cavity. The ellipsoids fill voxels; gaps between these are
@@ -17,7 +18,7 @@ import numpy.typing as npt
 from gsseg_core.errors import SettingsError
 from gsseg_core.export.poisson_surface import Ellipsoids, Voxels, poisson_surface, sphere
 from gsseg_core.objects.occupied_cells import OPAQUE, samples
-from gsseg_core.objects.oriented_boxes import without_floaters
+from gsseg_core.objects.oriented_boxes import class_box
 from gsseg_core.progress import Progress, silent
 from gsseg_core.scene.gaussian_scene import GaussianScene
 from gsseg_core.scene.quaternions import half_axes
@@ -81,9 +82,10 @@ def collision_mesh(
 ) -> TriangleMesh | None:
     """Make the mesh of one object, whose Gaussians are `ids`; None where it has no opaque Gaussian or no volume."""
     index = ids[scene.opacities[ids] >= OPAQUE]
-    if not len(index):
+    box = class_box(scene, ids, confidence[ids])
+    kept = index[(np.abs((scene.means[index] - box.center) @ box.axes) <= box.size / 2).all(axis=1)]
+    if not len(kept):
         return None
-    kept = index[without_floaters(scene.means[index].astype(np.float64), scene.opacities[index] * confidence[index])]
     make = {HULL: _hull, SURFACE: _surface, POISSON: _poisson}[kind]
     return make(Ellipsoids(scene.means[kept], half_axes(scene.quats[kept], scene.scales[kept])))
 

@@ -118,7 +118,7 @@ def oriented_box(
         )
     if not weights.any():
         weights = np.ones(len(points))
-    kept = without_floaters(points, weights)
+    kept = _without_floaters(points, weights)
     points, shape, weights = points[kept], shape[kept], weights[kept]
     share = weights / weights.sum()
     mean = share @ points
@@ -161,7 +161,7 @@ def object_boxes(scene: GaussianScene, result: Segmentation) -> dict[int, Orient
     return {k: class_box(scene, own, confidence[own]) for k, own in members.items() if k > 0}
 
 
-def without_floaters(points: Array, weights: Array) -> npt.NDArray[np.bool_]:
+def _without_floaters(points: Array, weights: Array) -> npt.NDArray[np.bool_]:
     """Mark points (M, 3) that are no farther than `FAR` times 90 % of the weight from the geometric median, (M,)."""
     middle = weights @ points / weights.sum()
     distance = np.linalg.norm(points - middle, axis=1)

@@ -244,6 +244,14 @@ def test_floaters_and_haze_do_not_blow_a_mesh_up() -> None:
         assert np.ptp(points, axis=0).max() < 1.1
 
 
+@pytest.mark.parametrize("kind", KINDS)
+def test_a_mesh_of_a_plate_reaches_no_farther_up_for_a_few_gaussians_above_it(kind: str) -> None:
+    points = np.random.default_rng(3).uniform(-1, 1, (1500, 3)) * (1, 1, 0.1)
+    points[:3] = (0, 0, 0.5), (0.3, 0.2, 0.8), (-0.2, 0.4, 1.2)
+    heights = meshes_in(*shells(points, 0.02), kind)[1].points[:, 2]
+    assert -0.2 < heights.min() < -0.05 and 0.05 < heights.max() < 0.2
+
+
 def test_an_object_without_a_volume_has_no_hull_and_a_surface_of_its_voxels() -> None:
     labels = np.zeros(len(SCENE), np.int32)
     labels[0] = 1
