@@ -87,7 +87,7 @@ def _products(scene: GaussianScene, views: list[View], num_classes: int, device:
     for view in chosen:
         operator = make_operator(scene, view.camera, device)
         image, seen = operator.render(codes), operator.observe(view.read_labels())
-        own = codes[seen.ids[seen.rows], seen.classes[seen.labels]] + np.float32(0.01)
+        own = codes[seen.places] + np.float32(0.01)
         rest = np.ones(len(seen.classes), np.float32)
         jobs = (
             lambda view=view: make_operator(scene, view.camera, device),

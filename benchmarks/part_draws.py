@@ -144,7 +144,7 @@ class Trial:
             number[self.lifted[name].ids] = objects[name]
             column = number[observation.classes][observation.labels]
             shown = column != UNKNOWN
-            np.add.at(votes, (observation.ids[observation.rows][shown], column[shown]), observation.votes()[shown])
+            np.add.at(votes, (observation.gaussians[shown], column[shown]), observation.votes()[shown])
         codes = votes / np.maximum(votes.sum(axis=1, keepdims=True), 1e-9)
         result = Segmentation.from_codes(self.scene, codes, {})
         found = {view.name: result.render(make_operator(self.scene, view.camera)).labels for view in self.tests}

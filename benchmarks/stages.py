@@ -74,7 +74,7 @@ def _view_stages(scene: GaussianScene, views: list[View], num_classes: int, runs
         camera, mask = view.camera, view.read_labels()
         projected, operator = project(scene, camera), make_operator(scene, camera)
         observation, depth = operator.observe(mask), depths(scene, camera, projected.ids)
-        mine = codes[observation.ids[observation.rows], observation.classes[observation.labels]]
+        mine = codes[observation.places]
         rest = np.ones(len(observation.classes), np.float32)
         add("project and sort", lambda c=camera: project(scene, c))
         add("of this, sort", lambda d=depth: sort_keys(d.view(np.uint32)))

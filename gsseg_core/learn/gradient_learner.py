@@ -145,7 +145,7 @@ def cross_entropy(probabilities: np.ndarray, observation: Observation) -> tuple[
     """
     gradient, scale = np.zeros_like(probabilities), 1.0 / (observation.num_pixels * probabilities.shape[1])
     if observation.evidence.mass is None:
-        where = observation.ids[observation.rows], observation.classes[observation.labels]
+        where = observation.places
         shares = observation.shares(probabilities[where], (observation.classes == 0).astype(np.float32))
         gradient[where] = -scale * shares.pairs
     else:

@@ -166,7 +166,10 @@ class ObjectTable:
 
     def sees_any(self, view: View, operator: ViewOperator | None = None) -> bool:
         """Whether a view has a mask and sees any Gaussian; takes what `add` does."""
-        return self._lift(view, operator) is not None
+        if (opened := self._open(view, operator)) is None:
+            return False
+        operator, labels, _ = opened
+        return len(operator.lift(labels).gaussians) > 0
 
     def set_aside(self, view: View) -> None:
         """Keep a view that sees nothing for now; what was known from it is taken back."""

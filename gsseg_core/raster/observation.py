@@ -96,6 +96,16 @@ class Observation(ABC):
         """Which of `ids` each pair is of, (P,) int64."""
         return np.repeat(np.arange(len(self.ids)), np.diff(self.start))
 
+    @property
+    def gaussians(self) -> np.ndarray:
+        """Gaussian of each pair, as an index in the scene, (P,) int32."""
+        return np.repeat(self.ids, np.diff(self.start))
+
+    @property
+    def places(self) -> tuple[np.ndarray, np.ndarray]:
+        """Gaussian and label of each pair, (P,) each: where it stands in W^T onehot(mask)."""
+        return self.gaussians, self.classes[self.labels]
+
     def dense(self, values: np.ndarray) -> np.ndarray:
         """Write one number per pair, (P,), out by Gaussian and label, (M, L); zero where there is no pair."""
         out = np.zeros((len(self.ids), len(self.classes)), values.dtype)
@@ -108,7 +118,7 @@ class Observation(ABC):
 
     def by_label(self) -> LabelWeights:
         """Sort the pairs and their votes by label."""
-        return LabelWeights.of(self.classes, self.ids[self.rows], self.labels, self.votes())
+        return LabelWeights.of(self.classes, self.gaussians, self.labels, self.votes())
 
     @abstractmethod
     def operator(self, camera: Camera, num_gaussians: int) -> ViewRenderer:
@@ -131,8 +141,8 @@ class Observation(ABC):
         rows, classes = self.ids.max(initial=-1) + 1, self.evidence.votes.indices.max(initial=0) + 1
         check_total(self.name, total, rows, classes)
         borders = self.start[np.arange(_PARTS + 1) * len(self.ids) // _PARTS]
-        gaussians, parts = np.repeat(self.ids, np.diff(self.start)), np.stack([borders[:-1], borders[1:]], axis=1)
-        total.add(PairVotes(gaussians, self.labels, self.votes(), parts), self.evidence.votes, sign)
+        parts = np.stack([borders[:-1], borders[1:]], axis=1)
+        total.add(PairVotes(self.gaussians, self.labels, self.votes(), parts), self.evidence.votes, sign)
 
     def shares(self, likelihood: np.ndarray, rest: np.ndarray) -> VoteShares:
         """Share one vote per labelled pixel, times its weight, among the Gaussians that made it.

@@ -130,7 +130,7 @@ class ViewOperator(ViewRenderer):
         self._check_labels(labels, evidence)
         most = int((labels if evidence is None else evidence.votes.indices).max(initial=0))
         if isinstance(total, VoteTotal):
-            self._check_rows(total.shape[0], None, what="votes")
+            self._check_rows(total.shape[0], what="votes")
         check_total(self.camera.name, total, self.num_gaussians, most + 1)
         return self._vote(labels, evidence, total, sign)
 
@@ -151,7 +151,7 @@ class ViewOperator(ViewRenderer):
 
         Raises `SceneValueError` where the labels are of another number of Gaussians.
         """
-        self._check_rows(len(labels), None, what="labels")
+        self._check_rows(len(labels), what="labels")
         return self._objects_alone(labels)
 
     def visibility(self) -> np.ndarray:

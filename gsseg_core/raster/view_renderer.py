@@ -136,7 +136,7 @@ class ViewRenderer(ABC):
         some pixels are `wanted`, (H, W) bool, others may have any value.
         """
 
-    def _rows(self, codes: CSRRows, num_classes: int, of: np.ndarray | None) -> np.ndarray:
+    def _rows(self, codes: CSRRows, num_classes: int, of: np.ndarray | None = None) -> np.ndarray:
         """Check sparse codes, and tell which of their rows each of `ids` has, (M,) int32."""
         self._check_rows(len(codes.indptr) - 1, of)
         self._check_classes(codes.indices, num_classes)
@@ -158,7 +158,7 @@ class ViewRenderer(ABC):
         return rows
 
     def _check_rows(
-        self, count: int, of: Sized | None, wanted: np.ndarray | None = None, what: str = "codes"
+        self, count: int, of: Sized | None = None, wanted: np.ndarray | None = None, what: str = "codes"
     ) -> None:  # fmt: skip
         """Refuse codes, or votes, that are not of all Gaussians, or those of some; and `wanted` of another size."""
         if wanted is not None:

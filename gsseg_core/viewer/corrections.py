@@ -157,7 +157,7 @@ def drawn_on(scene: GaussianScene, view: View, shown: np.ndarray | None = None, 
     full[operator.ids] = operator.footprints()
     weights = operator.adjoint((labels != UNKNOWN)[..., None].astype(np.float32))[observed.ids, 0]
     seen[observed.start[:-1]] = np.minimum(weights / full[observed.ids], 1)
-    return Correction(observed.ids[observed.rows], observed.classes[observed.labels], observed.votes(), seen)
+    return Correction(*observed.places, observed.votes(), seen)
 
 
 def _view(camera: Camera, drawn: np.ndarray, label: int) -> View:

@@ -79,8 +79,7 @@ class ViewVotes:
         for view in with_progress(progress, "collect the votes of each view", views):
             if view.has_mask:
                 observation = make_operator(scene, view.camera, device).observe(view.read_labels())
-                ids, labels = observation.ids[observation.rows], observation.classes[observation.labels]
-                self._votes[view.name] = ids, labels, observation.votes()
+                self._votes[view.name] = *observation.places, observation.votes()
 
     def of(self, gaussian: int) -> list[ViewVote]:
         """List the votes for the labels of one Gaussian, the largest first."""

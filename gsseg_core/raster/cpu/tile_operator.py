@@ -74,7 +74,7 @@ class TileOperator(ViewOperator):
 
     def blend_rows(self, codes: CSRRows, num_classes: int) -> Blended:
         """Blend codes without their zeros."""
-        return Blended(*products.render(self._tiles, codes, self._rows(codes, num_classes, None), num_classes))
+        return Blended(*products.render(self._tiles, codes, self._rows(codes, num_classes), num_classes))
 
     def strongest(
         self, codes: CSRRows, num_classes: int, background: bool, grid: PixelGrid = NO_PIXELS,

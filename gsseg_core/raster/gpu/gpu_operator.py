@@ -71,7 +71,7 @@ class GPUOperator(ViewOperator):
 
     def blend_rows(self, codes: CSRRows, num_classes: int) -> Blended:
         """Blend codes of which only the entries that are not zero are at hand."""
-        return _to_cpu(*self.blend_there(self._dense(codes, num_classes, None)))
+        return _to_cpu(*self.blend_there(self._dense(codes, num_classes)))
 
     def strongest(
         self, codes: CSRRows, num_classes: int, background: bool, grid: PixelGrid = NO_PIXELS,
@@ -88,7 +88,7 @@ class GPUOperator(ViewOperator):
         )  # fmt: skip
 
     def _dense(
-        self, codes: CSRRows | RowTensors, num_classes: int, of: np.ndarray | torch.Tensor | None,
+        self, codes: CSRRows | RowTensors, num_classes: int, of: np.ndarray | torch.Tensor | None = None,
         wanted: np.ndarray | None = None,
     ) -> torch.Tensor:  # fmt: skip
         """Write codes of `ids` out by class on the GPU, (M, K); `of` as in `strongest`. Both may be there already."""
