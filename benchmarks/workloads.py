@@ -5,13 +5,13 @@ from __future__ import annotations
 import json
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from automatic_masks import AutomaticMasks
 from garden import build_garden
 from room import Room, build_room
 
+from gsseg_core.data.camera_formats.gaussian_splatting import write_3dgs
 from gsseg_core.data.label_images import write_mask
 from gsseg_core.demo.mask_errors import corrupt
 from gsseg_core.raster.backends import make_operator
@@ -159,7 +159,7 @@ def write_room(
     room = make_room(size, seed)
     folder.mkdir(parents=True, exist_ok=True)
     room.scene.save(folder / "scene.ply")
-    (folder / "cameras.json").write_text(json.dumps([as_3dgs(camera) for camera in room.cameras]))
+    write_3dgs(folder / "cameras.json", room.cameras)
     names = {str(k): f"box {k}" for k in range(1, size.classes)}
     (folder / "classes.json").write_text(json.dumps(names))
     train, test = split(room.cameras, size.tests)
@@ -205,18 +205,3 @@ def true_labels(room: Room, camera: Camera, num_classes: int) -> np.ndarray:
     image[..., 0] += left_over
     labels: np.ndarray = image.argmax(axis=2).astype(np.int32)
     return labels
-
-
-def as_3dgs(camera: Camera) -> dict[str, Any]:
-    """Write a camera as an entry of a cameras.json."""
-    to_world = np.linalg.inv(camera.world_to_camera)
-    return {
-        "id": 0,
-        "img_name": camera.name,
-        "width": camera.width,
-        "height": camera.height,
-        "fx": camera.fx,
-        "fy": camera.fy,
-        "position": to_world[:3, 3].tolist(),
-        "rotation": to_world[:3, :3].tolist(),
-    }

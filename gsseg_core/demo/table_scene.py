@@ -16,6 +16,7 @@ import numpy as np
 from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
+from gsseg_core.data.camera_formats.gaussian_splatting import write_3dgs
 from gsseg_core.data.label_images import write_mask
 from gsseg_core.demo.furniture import CLASS_NAMES, TABLE_HEIGHT, Part, furnish
 from gsseg_core.demo.lighting import shade
@@ -71,7 +72,7 @@ def build_demo(folder: str | os.PathLike[str], seed: int = 0) -> DemoScene:
         scene.save(run.folder / "scene.ply")
         with write_atomically(run.folder / "truth.npz") as temporary:
             np.savez_compressed(temporary, labels=truth)
-        write_json(run.folder / "cameras.json", [_as_3dgs(camera) for camera in cameras])
+        write_3dgs(run.folder / "cameras.json", cameras)
         write_json(run.folder / "classes.json", dict(enumerate(CLASS_NAMES)))
         write_json(run.folder / "split.json", {"train": train, "test": test})
         for camera in cameras:
@@ -121,20 +122,6 @@ def _cast_view(parts: list[Part], camera: Camera) -> np.ndarray:
         nearest[window][nearer] = distance[nearer]
         labels[window][nearer] = part.label
     return labels
-
-
-def _as_3dgs(camera: Camera) -> dict[str, object]:
-    """One entry of cameras.json."""
-    return {
-        "id": int(camera.name),
-        "img_name": camera.name,
-        "width": camera.width,
-        "height": camera.height,
-        "position": camera.center.tolist(),
-        "rotation": camera.world_to_camera[:3, :3].T.tolist(),
-        "fx": camera.fx,
-        "fy": camera.fy,
-    }
 
 
 # Gaussians

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
-import json
 import shutil
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
-from small_scenes import NAMES, as_3dgs, balls_on_a_table, look_at, write_dataset
+from small_scenes import NAMES, balls_on_a_table, look_at, write_dataset
+
+from gsseg_core.data.camera_formats.gaussian_splatting import write_3dgs
 
 
 def write_long_dataset(folder: Path, count: int = 3000) -> Path:
@@ -20,12 +22,10 @@ def write_long_dataset(folder: Path, count: int = 3000) -> Path:
     ]
     write_dataset(folder, scene, truth, cameras, NAMES)
     (folder / "split.json").unlink()
-    entries = []
-    for i in range(count):
-        camera, name = cameras[i % len(cameras)], f"{i:05d}"
-        entries.append({**as_3dgs(camera), "img_name": name})
-        (folder / "labels" / f"{name}.png").symlink_to(f"{camera.name}.png")
-    (folder / "cameras.json").write_text(json.dumps(entries))
+    views = [replace(cameras[i % len(cameras)], name=f"{i:05d}") for i in range(count)]
+    write_3dgs(folder / "cameras.json", views)
+    for i, view in enumerate(views):
+        (folder / "labels" / f"{view.name}.png").symlink_to(f"{cameras[i % len(cameras)].name}.png")
     return folder
 
 

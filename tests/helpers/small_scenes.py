@@ -9,6 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
+from gsseg_core.data.camera_formats.gaussian_splatting import write_3dgs
 from gsseg_core.data.label_images import write_mask
 from gsseg_core.data.view import View
 from gsseg_core.export.pictures import palette
@@ -145,14 +146,6 @@ def mean_iou(learner: Learner) -> float:
     return evaluation.mean_iou
 
 
-def as_3dgs(camera: Camera) -> dict[str, object]:
-    to_world = np.linalg.inv(camera.world_to_camera)
-    return {
-        "id": 0, "img_name": camera.name, "width": camera.width, "height": camera.height, "fx": camera.fx,
-        "fy": camera.fy, "position": to_world[:3, 3].tolist(), "rotation": to_world[:3, :3].tolist(),
-    }  # fmt: skip
-
-
 def write_dataset(
     folder: Path,
     scene: GaussianScene | None = None,
@@ -169,7 +162,7 @@ def write_dataset(
     cameras = cameras or ring(6)
     folder.mkdir(parents=True, exist_ok=True)
     scene.save(folder / "scene.ply")
-    (folder / "cameras.json").write_text(json.dumps([as_3dgs(camera) for camera in cameras]))
+    write_3dgs(folder / "cameras.json", cameras)
     if names:
         (folder / "classes.json").write_text(json.dumps({str(k): name for k, name in names.items() if k}))
     stems = [camera.name for camera in cameras]
