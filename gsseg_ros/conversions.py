@@ -7,7 +7,6 @@ element by element, which takes seconds for a large cloud.
 from __future__ import annotations
 
 import array
-import difflib
 import math
 from collections.abc import Collection
 from typing import Any
@@ -16,7 +15,6 @@ import numpy as np
 import numpy.typing as npt
 from builtin_interfaces.msg import Time
 from geometry_msgs.msg import Point, Pose, PoseStamped, Quaternion, Transform, Vector3
-from rcl_interfaces.msg import FloatingPointRange, IntegerRange, ParameterDescriptor
 from sensor_msgs.msg import CameraInfo, Image
 from std_msgs.msg import Header
 
@@ -235,32 +233,6 @@ def plain_image(
     message = Image(header=header, height=height, width=width, encoding=encoding, is_bigendian=0, step=step)
     message.data = byte_array(values)
     return message
-
-
-def parameter_descriptor(
-    description: str, default: object, low: float | None, high: float | None, **more: bool
-) -> ParameterDescriptor:
-    """Describe a parameter; where it has limits, they are a range of its default's type."""
-    descriptor = ParameterDescriptor(description=description, **more)
-    if low is not None and high is not None:
-        if isinstance(default, int):
-            descriptor.integer_range = [IntegerRange(from_value=int(low), to_value=int(high))]
-        else:
-            descriptor.floating_point_range = [FloatingPointRange(from_value=float(low), to_value=float(high))]
-    return descriptor
-
-
-def passed_over(node: Any) -> str:
-    """Say which parameters a node was given that it does not have, which ROS passes over; empty if none.
-
-    It is no error: those of a file's `/**` may be of another node.
-    """
-    # rclpy has no public word for either; quality of service is declared with each topic.
-    known = node._parameters.keys()
-    strange = sorted(name for name in node._parameter_overrides.keys() - known if not name.startswith("qos_overrides."))
-    near = [difflib.get_close_matches(name, known, 1) for name in strange]
-    said = [name + "".join(f" (did you mean {one}?)" for one in ones) for name, ones in zip(strange, near, strict=True)]
-    return f"parameters that this node does not have are passed over: {', '.join(said)}" if said else ""
 
 
 def camera_info(camera: Camera, header: Header) -> CameraInfo:

@@ -14,8 +14,8 @@ from gsseg_core.raster.depth_gating import DepthTolerance
 from gsseg_core.refine.settings import MAX_K, RefineSettings
 from gsseg_core.scene.scene_writers import DEFAULT, SCENE_WRITERS
 from gsseg_ros.camera_infos import AUTO
-from gsseg_ros.conversions import parameter_descriptor
 from gsseg_ros.node.masks.compressed import TRANSPORTS
+from gsseg_ros.node_parameters import parameter_descriptor
 
 POSE_SOURCES = ("topic", "odometry", "tf", "auto")
 

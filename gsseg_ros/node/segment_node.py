@@ -24,7 +24,6 @@ from rclpy.signals import SignalHandlerOptions
 from gsseg_core.freed_memory import keep_freed_memory, search_no_imports_at_the_end
 from gsseg_core.live.living_session import LivingSession
 from gsseg_core.warm_up import warm_up
-from gsseg_ros.conversions import passed_over
 from gsseg_ros.node import declarations, diagnostics, parameters
 from gsseg_ros.node.complaints import Complaints
 from gsseg_ros.node.inputs import Inputs
@@ -39,6 +38,7 @@ from gsseg_ros.node.services import Services, describe
 from gsseg_ros.node.sim_time import SimTime, steady_timer
 from gsseg_ros.node.viewpoints import Lookup
 from gsseg_ros.node.workspace import Workspace
+from gsseg_ros.node_parameters import warn_of_unknown
 from gsseg_ros.shared_memory import make_room
 
 STOP_SECONDS = 3.0
@@ -78,8 +78,7 @@ class SegmentNode(LifecycleNode):
                 service.callback = self._answered(service.callback)
         self.configuring = False
         declarations.declare(self)
-        if strange := passed_over(self):
-            self.get_logger().warning(strange)
+        warn_of_unknown(self)
         self.workspace = Workspace(Settings.read(self), lambda: self.get_clock().now().to_msg())
         self.inputs: Inputs | None = None
         self.obstacles: Obstacles | None = None

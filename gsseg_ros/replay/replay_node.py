@@ -24,7 +24,8 @@ from sensor_msgs.msg import CameraInfo, Image
 
 from gsseg_core.errors import GssegError, SettingsError
 from gsseg_core.freed_memory import search_no_imports_at_the_end
-from gsseg_ros.conversions import parameter_descriptor, passed_over, stamp_message
+from gsseg_ros.conversions import stamp_message
+from gsseg_ros.node_parameters import parameter_descriptor, warn_of_unknown
 from gsseg_ros.replay.sources import TYPES, BagSource, FolderSource, Group
 from gsseg_ros.shared_memory import make_room
 
@@ -238,8 +239,7 @@ def _run(node: ReplayNode) -> int:
     log, start = node.get_logger(), None
     try:
         settings = node.declare()
-        if strange := passed_over(node):
-            log.warning(strange)
+        warn_of_unknown(node)
         source = make_source(settings)
         missing = source.without_mask if isinstance(source, FolderSource) else []
         if missing:
