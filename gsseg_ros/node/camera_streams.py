@@ -47,9 +47,8 @@ def camera_of(paired: Paired, size: tuple[int, int], settings: Settings) -> Came
 class CameraStreams:
     """Subscribes to the topics of one camera, and pairs what comes. Messages are only put aside.
 
-    Names of topics begin with its own, as "front" for `front/mask`; that of the only camera is empty. `prefix` is what
-    the names of all its views begin with; `era` tells the workspace's, and `refuse_pose` is told what is wrong with a
-    pose.
+    Names of topics begin with its own, as "front" for `front/mask`; that of the only camera is empty. Views are
+    named by the `activation`, too; `era` tells the workspace's, and `refuse_pose` is told what is wrong with a pose.
     """
 
     def __init__(
@@ -58,7 +57,7 @@ class CameraStreams:
         settings: Settings,
         tf: TfPoses | None,
         *,
-        prefix: str,
+        activation: str,
         listen: Listen,
         refuse_pose: Callable[[str], None],
         era: Callable[[], object],
@@ -70,7 +69,7 @@ class CameraStreams:
         if tf is not None and in_base is not None and np.array_equal(in_base, np.eye(4)):
             in_base = None  # It was not given, and TF knows it.
         self._frames = PoseFrames(settings.map_frame, tf, in_base)
-        self.pairing = Pairing(self.poses(), PairingSettings(with_depth=settings.depth_gating), prefix, name)
+        self.pairing = Pairing(self.poses(), PairingSettings(with_depth=settings.depth_gating), activation, name)
         self._pairings = [self.pairing]
         topics: list[tuple[Any, str, Callable[[str, Any], None]]] = [(CameraInfo, "camera_info", self.on_camera_info)]
         if settings.depth_gating:

@@ -101,9 +101,8 @@ class Inputs:
         activation = secrets.token_hex(4)
         workspace.activations.add(activation)
         for name in settings.cameras or ("",):
-            prefix = f"{activation}_{name}_" if name else f"{activation}_"
             camera = CameraStreams(
-                name, settings, self.tf, prefix=prefix, listen=partial(self._listen, built),
+                name, settings, self.tf, activation=activation, listen=partial(self._listen, built),
                 refuse_pose=self._refuse_pose, era=lambda: workspace.era,
             )  # fmt: skip
             images = CameraImages(node, outputs, self.live, camera, self._group, compressed=compressed)

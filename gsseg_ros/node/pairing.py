@@ -15,12 +15,12 @@ from typing import Any, NamedTuple, TypeAlias
 from gsseg_ros.node.history import History, too_many
 from gsseg_ros.node.pose_sources import GivenPose, MessagePoses, Pose, PoseSource
 from gsseg_ros.node.timeline import BEHIND_NS, MASK, SECOND, Message, Timeline
+from gsseg_ros.node.view_names import CAMERAS_KEPT, ViewName
 
 _Key: TypeAlias = tuple[int, str]  # stamp and frame_id
 
 _CAMERA_INFOS_KEPT = 600  # Of each camera; at 60 Hz, those of ten seconds.
 _STAMPS_KEPT = 1000
-CAMERAS_KEPT = 16
 _UNCLEAR_NS = 10 * SECOND
 _DEPTH_BYTES = 64 << 20  # At 30 Hz, VGA and 16 bit, those of three seconds.
 _HELD_BACK = 30  # Messages, by `Timeline`.
@@ -35,7 +35,7 @@ MOST_BYTES = 256 << 20
 class Paired(NamedTuple):
     """A mask with all that belongs to it."""
 
-    name: str  # Unique: the pairing's prefix, the epoch, the stamp, and at one stamp the number of the camera.
+    name: str  # As `ViewName` says.
     stamp: int
     mask: Any
     camera_info: Any
@@ -80,12 +80,12 @@ class Pairing:
 
     What is late and what shows that time was set back is said in `gsseg_ros.node.timeline.Timeline`.
 
-    Names of pairs begin with `prefix`, for epochs and stamps of another pairing may be the same; with every pair comes
-    `stream`, which says of which camera it is.
+    Pairs are named by the `activation` and the `stream`, for epochs and stamps of another pairing may be the same; with
+    every pair comes `stream`, which says of which camera it is.
     """
 
     def __init__(
-        self, poses: PoseSource, settings: PairingSettings | None = None, prefix: str = "", stream: str = ""
+        self, poses: PoseSource, settings: PairingSettings | None = None, activation: str = "", stream: str = ""
     ) -> None:
         # Masks not paired, by reason: "no_pose", "bad_pose" (it came and was refused), "no_camera_info", "no_depth",
         # "repeated_stamp" (and the same frame_id), "several_cameras" (whose poses cannot be told apart),
@@ -95,7 +95,7 @@ class Pairing:
         self.unmatched_frame: str | None = None  # frame_id of the last mask that was dropped for want of a camera_info
         self.negative_stamp = 0  # that of the last mask that was dropped for it, ns
         self._poses = poses
-        self._prefix, self._stream = prefix, stream
+        self._activation, self._stream = activation, stream
         self._settings = settings or PairingSettings()
         self._lock = threading.Lock()
         self._timeline = Timeline(min(_HELD_BACK, self._settings.max_waiting))
@@ -263,7 +263,7 @@ class Pairing:
         frames.append(frame_id)
         if len(frames) > 1:
             self._unclear_until = max(self._unclear_until, stamp + _UNCLEAR_NS)
-        self._waiting[stamp, frame_id] = _Waiting(*content, len(frames))
+        self._waiting[stamp, frame_id] = _Waiting(*content, str(len(frames)) if len(frames) > 1 else "")
 
     def _add_camera_info(self, stamp: int, message: Any, frame_id: str) -> None:
         infos = self._camera_infos.pop(frame_id, None) or _CameraInfos(_CAMERA_INFOS_KEPT)
@@ -283,10 +283,10 @@ class Pairing:
         if several and not self._poses.knows_frames:
             self.dropped["several_cameras"] += 1
         elif waiting.pose is not None and info is not None and (depth or not self._settings.with_depth):
-            name = f"{self._prefix}{self._timeline.epoch if epoch is None else epoch}_{stamp}"
-            name += f"_{waiting.camera}" * (waiting.camera > 1)
+            times = str(self._timeline.epoch if epoch is None else epoch), str(stamp)
+            name = ViewName(self._activation, self._stream, *times, waiting.number)
             mask, era, size = waiting.mask, waiting.era, waiting.size
-            self._finished.append(Paired(name, stamp, mask, info, waiting.pose, era, depth, self._stream, size))
+            self._finished.append(Paired(str(name), stamp, mask, info, waiting.pose, era, depth, self._stream, size))
             if (infos := self._infos_of(frame_id)) is not None:
                 infos.found.append(stamp in infos.values)
         elif waiting.pose is None:
@@ -367,6 +367,6 @@ class _Waiting:
     mask: Any
     era: object
     size: int  # bytes
-    camera: int  # Among those with masks of this stamp, from 1.
+    number: str  # As in its `ViewName`.
     pose: Pose | None = None
     since: float | None = None

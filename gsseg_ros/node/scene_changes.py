@@ -3,12 +3,10 @@
 from __future__ import annotations
 
 import itertools
-import re
 import time
 from collections.abc import Callable, Container
 from dataclasses import replace
 from functools import partial
-from typing import TypeAlias
 
 from gsseg_msgs.msg import SceneDelta as SceneDeltaMessage
 from gsseg_msgs.srv import MergeStates, UpdateScene
@@ -20,14 +18,9 @@ from gsseg_core.scene.scene_delta import SceneDelta
 from gsseg_ros.delta_messages import delta_from_message
 from gsseg_ros.errors import InvalidRequestError
 from gsseg_ros.node.complaints import SCENE_DELTA
-from gsseg_ros.node.pairing import CAMERAS_KEPT
 from gsseg_ros.node.services import Services, answered, explain, in_turn
+from gsseg_ros.node.view_names import ViewName
 from gsseg_ros.qos import reliable
-
-_STAMP = re.compile(r"[0-9]+")
-_CAMERA_NUMBERS = frozenset(map(str, range(2, CAMERAS_KEPT + 1)))
-
-_Key: TypeAlias = tuple[str, ...]
 
 
 class SceneChanges:
@@ -100,7 +93,7 @@ class SceneChanges:
             response.num_views, response.class_names = session.num_fused, list(session.class_names.values())
 
     def _update(self, session: LivingSession, delta: SceneDelta) -> Changed:
-        if stamps := {view for move in delta.moves for view in move.views if _STAMP.fullmatch(view)}:
+        if stamps := {view for move in delta.moves for view in move.views if view.isdecimal()}:
             self._await_fused(stamps)
         try:
             # Between what it is named by, where views are and what is fused, nothing else may happen.
@@ -130,27 +123,17 @@ def _with_names(delta: SceneDelta, session: LivingSession, own: Container[str]) 
     Where time was set back, or the node was activated again, these are those of the last time of each camera. Views of
     its own activations go before others, which may be another robot's: in one simulator they carry the same stamps.
     """
-    stamped: dict[str, dict[_Key, tuple[_Key, list[str]]]] = {}
-    for name in session.view_names:
-        camera, time_of, stamp = _taken_apart(name)
-        rounds = stamped.setdefault(stamp, {})
-        if camera in rounds and rounds[camera][0][0] in own and time_of[0] not in own:
+    stamped: dict[str, dict[str, list[ViewName]]] = {}  # by stamp and camera
+    for name in filter(None, map(ViewName.of, session.view_names)):
+        newest = stamped.setdefault(name.stamp, {}).setdefault(name.camera, [])
+        if newest and newest[0].activation in own and name.activation not in own:
             continue
-        if camera not in rounds or rounds[camera][0] != time_of:
-            rounds[camera] = (time_of, [])
-        rounds[camera][1].append(name)
+        if newest and (newest[0].activation, newest[0].epoch) != (name.activation, name.epoch):
+            newest.clear()
+        newest.append(name)
 
     def named(views: tuple[str, ...]) -> tuple[str, ...]:
-        found = ([name for _, names in stamped.get(view, {}).values() for name in names] or [view] for view in views)
+        found = ([str(name) for names in stamped.get(view, {}).values() for name in names] or [view] for view in views)
         return tuple(itertools.chain.from_iterable(found))
 
     return replace(delta, moves=tuple(replace(move, views=named(move.views)) for move in delta.moves))
-
-
-def _taken_apart(name: str) -> tuple[_Key, _Key, str]:
-    """Take the name of a view apart, which `pairing` has put together: camera, activation and epoch, stamp."""
-    parts = name.split("_")
-    # At one stamp, views of one topic have the numbers of their cameras at the end.
-    if len(parts) > 3 and parts[-1] in _CAMERA_NUMBERS and all(map(_STAMP.fullmatch, parts[-3:])):
-        del parts[-1]
-    return tuple(parts[1:-2]), (*parts[:1], *parts[-2:-1]), parts[-1]
