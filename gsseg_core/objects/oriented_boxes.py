@@ -167,7 +167,7 @@ def _without_floaters(points: Array, weights: Array) -> npt.NDArray[np.bool_]:
     distance = np.linalg.norm(points - middle, axis=1)
     for _ in range(_STEPS):
         # A point that the median comes to lie on must not take all the weight.
-        pull = weights / np.maximum(distance, 1e-6 * distance.max() + 1e-300)
+        pull = weights / np.maximum(distance, 1e-6 * distance.max() or 1.0)
         before, middle = middle, pull @ points / pull.sum()
         distance = np.linalg.norm(points - middle, axis=1)
         if np.linalg.norm(middle - before) <= _SETTLED * distance.max():

@@ -128,9 +128,9 @@ def test_a_gaussian_reaches_as_far_as_its_own_standard_deviation() -> None:
 @pytest.mark.parametrize("weight", [0.0, 1.0])
 @pytest.mark.parametrize(
     "points",
-    [np.zeros((1, 3)), np.zeros((7, 3)), np.eye(3), np.linspace(0, 1, 20)[:, None] * [1, 2, 3],
+    [np.zeros((1, 3)), np.zeros((7, 3)), np.full((7, 3), 1e9), np.eye(3), np.linspace(0, 1, 20)[:, None] * [1, 2, 3],
      np.pad(np.random.default_rng(0).random((50, 2)), ((0, 0), (0, 1)))],
-    ids=["one", "one place", "three", "line", "plane"],
+    ids=["one", "one place", "one place far off", "three", "line", "plane"],
 )  # fmt: skip
 def test_points_without_volume_get_a_box_too(points: np.ndarray, weight: float) -> None:
     box = oriented_box(points, np.zeros((len(points), 3, 3)), np.full(len(points), weight))
