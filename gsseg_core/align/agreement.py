@@ -26,6 +26,7 @@ from gsseg_core.data.label_images import UNKNOWN
 from gsseg_core.data.view import View, spread
 from gsseg_core.errors import GssegError
 from gsseg_core.raster.backends import make_operator
+from gsseg_core.raster.constants import NEAR
 from gsseg_core.raster.depth import colours_and_depth
 from gsseg_core.scene.camera import Camera
 from gsseg_core.scene.gaussian_scene import GaussianScene
@@ -38,6 +39,8 @@ _BLUR = np.exp(-0.5 * np.arange(-_REACH, _REACH + 1, dtype=np.float32) ** 2)  # 
 _BLUR /= _BLUR.sum()
 _SLOPE = np.arange(-_REACH, _REACH + 1, dtype=np.float32) * _BLUR  # of a blurred picture, a px
 _WIDEST = 1e4  # tangent of half the field of view; a camera that claims more is broken
+_CUT = 0.01  # share of what cameras look at that may be too near to be drawn; of scenes of a usual size it is none
+ROUNDED = 0.5  # standard deviations of Gaussians that float32 may move them by; from there on labels get worse
 _NEAREST = 1e-3  # depth in scene units below which logarithms are not taken
 
 
@@ -86,6 +89,7 @@ class Agreement:
     score: float  # of the views, 0 to 1
     chance: float  # of pictures that do not belong together
     agrees: bool | None  # whether cameras and scene belong together; None where that is undecided
+    too_near: float = 0.0  # share of the Gaussians in the views' pictures that are too near to be drawn
 
     @property
     def doubt(self) -> str:
@@ -95,9 +99,30 @@ class Agreement:
         looks = "hardly looks" if self.agrees is None else "does not look"
         return f"the scene {looks} as the {self.compared} do from these cameras"
 
+    @property
+    def nearness(self) -> str:
+        """Say in a sentence without its stop that a scene is too small to be drawn whole; "" if it is not."""
+        if self.too_near < _CUT:
+            return ""
+        return (
+            f"{100 * self.too_near:.0f} % of what cameras look at is nearer to them than {NEAR} scene units, where "
+            "nothing is drawn: scale scene and cameras up by the same factor, as from kilometres to metres"
+        )
+
     def __str__(self) -> str:
         """Describe it for people."""
         return f"agreement with {self.views} {self.compared} {self.score:.2f}, by chance {self.chance:.2f}"
+
+
+def far_off(rounding: float) -> str:
+    """Say in a sentence without its stop that a scene is too far from its origin for float32; "" if it is not."""
+    if rounding < ROUNDED:
+        return ""
+    return (
+        f"the scene is so far from its origin that float32 moves Gaussians by up to {rounding:.2g} times their size "
+        "(the median): take the same offset from Gaussians and cameras where they still are float64, as before UTM "
+        "coordinates are written into the scene"
+    )
 
 
 def look_at(views: Sequence[View], settings: AlignSettings) -> list[Shown]:
@@ -140,7 +165,17 @@ def agreement(
     photos = shown[0].labels is None
     disagrees, agrees = settings.photo_margins if photos else settings.mask_margins
     verdict = True if score - chance >= agrees else False if score - chance < disagrees else None
-    return Agreement("photos" if photos else "masks", len(shown), score, chance, verdict)
+    too_near = _too_near(few, [view.camera for view in shown])
+    return Agreement("photos" if photos else "masks", len(shown), score, chance, verdict, too_near)
+
+
+def _too_near(scene: GaussianScene, cameras: Sequence[Camera]) -> float:
+    """Share of the centres in the images of some cameras that are nearer than what is drawn."""
+    depths = [np.zeros(0)]
+    for camera in cameras:
+        pixels, depth = camera.project(scene.means)
+        depths.append(depth[((pixels >= 0) & (pixels < (camera.width, camera.height))).all(axis=1)])
+    return float((np.concatenate(depths) < NEAR).mean()) if any(map(len, depths)) else 0.0
 
 
 def thinned(scene: GaussianScene, most: int) -> GaussianScene:

@@ -9,7 +9,7 @@ from functools import cached_property
 from pathlib import Path
 from typing import Any
 
-from gsseg_core.align.agreement import Agreement, Shown, agreement, look_at
+from gsseg_core.align.agreement import Agreement, Shown, agreement, far_off, look_at
 from gsseg_core.align.conventions import Alignment, find_convention
 from gsseg_core.align.features import PhotosInScene
 from gsseg_core.align.settings import AlignSettings
@@ -23,6 +23,7 @@ from gsseg_core.progress import Progress, silent
 from gsseg_core.scene.gaussian_scene import GaussianScene
 from gsseg_core.scene.similarity import Similarity
 
+_LOST = 4.0  # standard deviations of Gaussians by which float32 moves them where a scene has lost what photos show
 _CLOSE_PX = 1.0  # photos and renderings that are no farther apart lie upon each other
 
 
@@ -64,6 +65,8 @@ class Placed:
             lines += [f"not aligned as it is ({self.found.before}); aligned by what --align does:"]
             lines += [f"  - {part}" for part in parts]
         lines += [f"aligned: {self.found.agreement}"]
+        if nearness := self.found.agreement.nearness:
+            lines += [f"too small: {nearness}"]
         if self.found.offset_px is not None:
             lines += [f"photos and renderings are {self.found.offset_px:.2f} px apart (median of their features)"]
         return "\n".join(lines)
@@ -124,6 +127,9 @@ def find_alignment(
         raise AlignmentError(
             "alignment: no view has a photo, or a mask with outlines; expected some, to see where cameras are by them"
         )
+    told = far_off(scene.rounding) if scene.rounding >= _LOST else "" if before.agrees else before.nearness
+    if told:  # To search takes minutes, and finds nothing.
+        raise AlignmentError(f"alignment: {told}")
     search, agreeing = _Search(scene, views, shown, before, settings, device), list[Found]()
     # Masks say less than photos do: the regions of a shelf may agree from a wrong side, too.
     if before.agrees and search.has_photos:

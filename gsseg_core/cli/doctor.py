@@ -118,6 +118,7 @@ def run(options: argparse.Namespace) -> int:
 
 def _examine_frame(options: argparse.Namespace) -> int:
     """Look whether the cameras of a dataset fit a scene, and print what makes them fit."""
+    from gsseg_core.align.agreement import far_off
     from gsseg_core.data.dataset import Dataset
     from gsseg_core.scene.gaussian_scene import GaussianScene
 
@@ -125,6 +126,8 @@ def _examine_frame(options: argparse.Namespace) -> int:
     load_kernels(options.quiet, options.device)
     found = placed(options, scene, dataset, align=True)
     tell(found.describe())
+    if told := far_off(scene.rounding):
+        note(told)
     return 0 if found.fits else 2
 
 

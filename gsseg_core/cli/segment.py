@@ -109,21 +109,14 @@ def run(options: argparse.Namespace) -> int:
 
 def _note_doubts(options: argparse.Namespace, report: dict[str, Any]) -> None:
     """Warn of what makes a whole run worthless."""
-    from gsseg_core.align.agreement import Agreement
-    from gsseg_core.report.findings import NO_OBJECTS, grey_ids_of, has_objects, renamed_ids_of, rounding_of
+    from gsseg_core.report.findings import NO_OBJECTS, frame_of, grey_ids_of, has_objects, renamed_ids_of
 
     known = [view["reliability"] for view in report["views"].get("reliability", ()) if view["reliability"] is not None]
     if known and median(known) < _HALF and report["settings"]["ids"] == "global":
         note(f"most masks contradict the others: {OWN_IDS}")
     elif of_ids := grey_ids_of(report) or renamed_ids_of(report):
         note(of_ids)
-    agreement = report["frame"]["agreement"]
-    if agreement and (doubt := Agreement(**agreement).doubt):
-        note(
-            f"{doubt}: the two may be in different frames; try --align, or gsseg doctor {options.data} --scene "
-            f"{options.scene}"
-        )
-    if rounding := rounding_of(report):
-        note(rounding)
+    for told in frame_of(report, f"{options.data} --scene {options.scene}"):
+        note(told)
     if not has_objects(report):
         note(f"no Gaussian is part of an object: {NO_OBJECTS}")

@@ -8,6 +8,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from gsseg_core.align.agreement import Agreement, far_off
 from gsseg_core.data.class_names import NOTED, class_name, listed
 from gsseg_core.data.label_images import EXPECTED_IDS
 from gsseg_core.data.view import View
@@ -20,7 +21,6 @@ SHOWN = 1 / 2000  # of its checked pixels a class has at least in a view that sh
 TRUSTED = 0.7  # the page warns of masks with which the other views agree in a smaller share of their pixels, ...
 KNOWN_CLASS = 0.5  # ... and of classes whose IoU with the masks is smaller than this
 FEW_VIEWS = 3
-ROUNDED = 0.5  # standard deviations of Gaussians that float32 may move them by; from there on labels get worse
 _SHADES, _HARDLY_ANY = 32, 10  # so many ids of fewer Gaussians than that are shades of grey
 NO_OBJECTS = f"the masks name none, or contradict each other; {EXPECTED_IDS}"
 
@@ -89,16 +89,14 @@ def has_objects(report: Mapping[str, Any]) -> bool:
     return any(entry["gaussians"] for entry in report["classes"] if entry["id"])
 
 
-def rounding_of(report: Mapping[str, Any]) -> str:
-    """Say in a sentence without its stop that a scene is too far from its origin for float32; "" if it is not."""
-    rounding = report["scene"].get("rounding", 0.0)
-    if rounding < ROUNDED:
-        return ""
-    return (
-        f"the scene is so far from its origin that float32 moves Gaussians by up to {rounding:.2g} times their size "
-        "(the median): take the same offset from Gaussians and cameras where they still are float64, as before UTM "
-        "coordinates are written into the scene"
-    )
+def frame_of(report: Mapping[str, Any], asked: str = "DATASET --scene SCENE") -> list[str]:
+    """Say in sentences without their stops why views may not see the scene as it is; `gsseg doctor` takes `asked`."""
+    told, agreement = [far_off(report["scene"].get("rounding", 0.0))], report.get("frame", {}).get("agreement")
+    if agreement:
+        found = Agreement(**agreement)
+        frames = f"the two may be in different frames; try --align, or gsseg doctor {asked}"
+        told.append(found.nearness or (found.doubt and f"{found.doubt}: {frames}"))
+    return [sentence for sentence in told if sentence]
 
 
 def grey_ids_of(report: Mapping[str, Any]) -> str:
@@ -146,7 +144,7 @@ def warnings_of(
             f"{listed((view['name'] for view in doubtful), NOTED, written)}. Wrong ids, a wrong pose, or a mask "
             "of another image?"
         )
-    for told in (rounding_of(report), grey_ids_of(report) or renamed_ids_of(report, written)):
+    for told in (*frame_of(report), grey_ids_of(report) or renamed_ids_of(report, written)):
         if told:
             warnings.append(f"{told[:1].upper()}{told[1:]}.")
     names = dict(enumerate(entry["name"] for entry in report["classes"]))

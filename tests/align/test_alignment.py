@@ -311,6 +311,30 @@ def test_doctor_says_what_makes_cameras_fit_and_whether_they_did(
     assert "expected a dataset, too" in capsys.readouterr().err
 
 
+SMALL, FAR = "of what cameras look at is nearer to them than 0.01", "the scene is so far from its origin that float32"
+
+
+@pytest.mark.parametrize(
+    ("scale", "offset", "exit_code", "said"), [(0.012, 0, 0, SMALL), (0.006, 0, 2, SMALL), (1.0, 1e7, 2, FAR)]
+)
+def test_that_a_scene_is_too_small_or_too_far_off_is_said_at_once_and_everywhere(
+    scale: float, offset: float, exit_code: int, said: str, demo: Path, scene: GaussianScene, tmp_path: Path,
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch,
+) -> None:  # fmt: skip
+    frame = Similarity(scale, np.eye(3), np.full(3, offset))
+    data, file = write_moved(demo, tmp_path / "data", frame.camera), f"{tmp_path}/scene.ply"
+    means, scales = frame.points(scene.means), scene.scales * scale
+    GaussianScene.from_arrays(means, scene.quats, scales, scene.opacities, scene.sh).save(file)
+    monkeypatch.setattr(placing, "find_convention", lambda *_: pytest.fail("looked for, in vain and for minutes"))
+    monkeypatch.setattr(placing._Search, "has_photos", True)
+    monkeypatch.setattr(placing._Search, "closer", lambda _, *found: Found(*found, found[1], 0.2))
+    assert main(["doctor", str(data), "--scene", file, "--quiet"]) == exit_code
+    assert said in "".join(capsys.readouterr())
+    quick = ["--quiet", "--learner", "votes", "--views", "4", "--no-knn", "--no-filter", "--out", str(tmp_path / "out")]
+    assert main(["segment", file, "--data", str(data), *quick]) == 0
+    assert said in capsys.readouterr().err and said[1:] in (tmp_path / "out/report.html").read_text()
+
+
 @pytest.mark.usefixtures("few_views", "few_axes")
 def test_segment_warns_too_where_nobody_can_tell_whether_cameras_fit(
     demo: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
@@ -331,6 +355,7 @@ def test_segment_warns_in_one_line_of_cameras_that_do_not_fit_and_align_mends_it
     quick = ["--quiet", "--learner", "votes", "--views", "4", "--no-knn", "--no-filter", "--out", str(tmp_path / "out")]
     assert main(["segment", scene, "--data", str(lost), *quick]) == 0
     assert capsys.readouterr().err.count("try --align") == 1
+    assert "The scene does not look as the masks do from these cameras" in (tmp_path / "out/report.html").read_text()
     assert json.loads((tmp_path / "out/report.json").read_text())["frame"]["agreement"]["agrees"] is False
 
     assert main(["segment", scene, "--data", str(turned), *quick, "--align"]) == 0

@@ -14,6 +14,8 @@ from small_scenes import NAMES, balls_on_a_table, clean_views, fed, write_datase
 
 from gsseg_core.data.view import View
 from gsseg_core.live.living_session import LivingSession
+from gsseg_core.scene.gaussian_scene import GaussianScene
+from gsseg_core.scene.similarity import Similarity
 from gsseg_ros.node.frame_check import FrameCheck
 
 
@@ -44,6 +46,15 @@ def test_what_was_found_holds_until_the_views_are_forgotten_or_others_are_learnt
     frames.look(session, session.scene, session.learn())
     session.reset()
     assert frames.problem(session) == ""
+
+
+def test_a_scene_too_small_to_be_drawn_whole_is_complained_of() -> None:
+    scene, small = balls_on_a_table()[0], Similarity(0.002, np.eye(3), np.zeros(3))
+    means, scales = small.points(scene.means), small.scale * scene.scales
+    shrunk = GaussianScene.from_arrays(means, scene.quats, scales, scene.opacities, scene.sh)
+    views = [replace(view, camera=small.camera(view.camera)) for view in clean_views()]
+    session = fed(LivingSession(shrunk, NAMES), views)
+    assert "is nearer to them than 0.01 scene units" in FrameCheck().look(session, shrunk, session.learn())
 
 
 def test_the_log_and_diagnostics_say_so(ros: Ros, tmp_path: Path) -> None:
