@@ -21,14 +21,16 @@ def parameter_descriptor(
     return descriptor
 
 
-def warn_of_unknown(node: Node) -> None:
+def warn_of_unknown(node: Node, of_topics: bool = False) -> None:
     """Warn of parameters that a node was given and has not declared, which ROS passes over.
 
-    It is no error: those of a file's `/**` may be of another node.
+    It is no error: those of a file's `/**` may be of another node. Qualities of service, `of_topics`, are declared with
+    each topic, and so are known only once all of these are there.
     """
-    # rclpy has no public word for either; quality of service is declared with each topic.
+    # rclpy has no public word for either.
     known = node._parameters.keys()
-    strange = sorted(name for name in node._parameter_overrides.keys() - known if not name.startswith("qos_overrides."))
+    given = (name for name in node._parameter_overrides if name.startswith("qos_overrides.") == of_topics)
+    strange = sorted({*given} - known)
     near = [difflib.get_close_matches(name, known, 1) for name in strange]
     said = [name + "".join(f" (did you mean {one}?)" for one in ones) for name, ones in zip(strange, near, strict=True)]
     if said:

@@ -180,6 +180,7 @@ class SegmentNode(LifecycleNode):
         self.inputs = Inputs(self, self.workspace, self._require_outputs(), self._complaints)
         self.obstacles = Obstacles(self, self.workspace, self._complaints)
         self.workspace.active = True
+        warn_of_unknown(self, of_topics=True)
         if self._out_of_place:
             threading.Thread(target=self._publish_again, name="publish again").start()
         topics = ", ".join(self.inputs.arrivals)

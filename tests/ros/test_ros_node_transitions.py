@@ -172,6 +172,19 @@ def test_a_misspelt_quality_of_service_is_one_clear_error(
     assert not robot.publishers["mask"].get_subscription_count()
 
 
+def test_a_quality_of_service_of_no_topic_is_named_with_the_one_that_was_meant(
+    ros: Ros, parameters: dict[str, Any]
+) -> None:
+    given = {"qos_overrides./maks.subscription.reliability": "reliable", "qos_overrides./mask.subscription.depth": 7}
+    robot = Robot(ros)
+    process = robot.start(parameters | given, lossless=False)
+    robot.wait_active()
+    assert (
+        "parameters that this node does not have are passed over: qos_overrides./maks.subscription.reliability (did "
+        "you mean qos_overrides./mask.subscription.reliability?)\n" in process.output
+    )
+
+
 def test_the_state_is_told_and_changed_while_the_session_is_locked(
     ros: Ros, node: SegmentNode, monkeypatch: pytest.MonkeyPatch
 ) -> None:
