@@ -20,6 +20,7 @@ from gsseg_core.data.mask_formats.place import SUPERVISES
 from gsseg_core.data.mask_formats.table import open_masks
 from gsseg_core.errors import GssegError
 from gsseg_core.files.input_files import READABLE_IMAGES, list_folder
+from gsseg_core.text import counted
 
 # Camera files of other programs, and how one gets from each to one that is read.
 _FOREIGN_CAMERAS = {
@@ -80,6 +81,9 @@ def mask_hint(root: Path, labels: str, stems: Collection[str]) -> str:
     looked = f"; looked for {folder}/{stem}.png ({stem}.npz, or a folder {stem}/) and so on"
     for_each = f"for each view, {labels}/{stem}/<class id>.png ({_MORE})"
     expected = f"label images as PNG, and probabilities as {stem}.npz or {stem}/<class id>.tif ({_MORE})"
+    with suppress(GssegError, OSError):
+        if (masks := open_masks(folder, stems)) and all(mask.blank for mask in masks.views.values()):
+            return f"; {folder} lists {counted(len(masks.views), 'image')} of these names, and no shape in any of them"
     if classes := _folders_by_class(folder, stems):
         wrong = f"{labels}/ has a folder for each class, such as {classes[0].name}/"
         return f"{looked}, but {wrong}: make one {for_each}"
@@ -189,7 +193,7 @@ def _count_foreign(place: Path, stems: Collection[str], depth: int) -> int:
     """Count the masks of the given stems that another program wrote, in folders of so many levels at most."""
     with suppress(GssegError, OSError):
         masks = open_masks(place, stems, depth=depth)
-        return 0 if masks is None else len(masks.views)
+        return 0 if masks is None else sum(not mask.blank for mask in masks.views.values())
     return 0
 
 

@@ -84,6 +84,14 @@ def test_an_image_in_which_automatic_masks_found_nothing_is_all_background(tmp_p
     assert not first.read_labels().any() and second.read_labels().any()
 
 
+def test_automatic_masks_that_found_nothing_in_any_image_are_said_to_have(tmp_path: Path) -> None:
+    place = tmp_path / written(tmp_path, mask_writers.sam_json)
+    for path in place.iterdir():
+        path.write_text("[]")
+    with pytest.raises(MaskFormatError, match="but an empty list, and so are those of the other views: nothing was fo"):
+        Dataset(tmp_path, place)
+
+
 def test_a_file_of_more_masks_than_there_are_labels_is_not_painted_for_other_views(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -83,6 +83,19 @@ def test_an_export_as_coco_that_is_named_by_its_folder_is_answered_with_its_file
         assert (data / file).resolve() == annotations.resolve()
 
 
+def test_a_file_that_lists_images_without_a_shape_is_said_to_have_none(
+    data: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    labels = {path.stem: np.zeros_like(Image.open(path)) for path in (data / "labels").iterdir()}
+    shutil.rmtree(data / "labels")
+    mask_writers.coco(data, labels, {0: "background", 1: "mug"})
+    (data / "annotations.json").rename(data / "labels.json")
+    for named in ("labels.json", "labels"):
+        error = error_of(capsys, data, "--labels", named)
+        assert ("labels.json lists 4 images of these names, and no shape in any of them" in error) == ("." in named)
+        assert "type --labels" not in error
+
+
 def test_masks_in_several_folders_are_found_together(data: Path, capsys: pytest.CaptureFixture[str]) -> None:
     for i, path in enumerate(sorted((data / "labels").iterdir())):
         (data / f"masks/{i % 2}").mkdir(parents=True, exist_ok=True)

@@ -159,6 +159,8 @@ def known_formats() -> str:
 
 def _foreign_hint(content: object) -> str:
     """Say whose a JSON file is that is not read, and what to do, if its first record tells."""
+    if content == []:
+        return ", but an empty list, and so are those of the other views: nothing was found in any"
     listed = content if isinstance(content, list) else [content, *content.values()] if isinstance(content, dict) else []
     fields = [record.keys() for record in listed[:2] if isinstance(record, dict)]
     return next((f", but {told}" for marks, told in _FOREIGN if any(marks <= keys for keys in fields)), "")
