@@ -18,7 +18,7 @@ from gsseg_core import pipeline
 from gsseg_core.cli.main import main
 from gsseg_core.csr_rows import CSRRows
 from gsseg_core.data.dataset import Dataset
-from gsseg_core.data.label_images import read_mask, write_mask
+from gsseg_core.data.label_images import UNKNOWN, read_mask, write_mask
 from gsseg_core.errors import UnknownLabelError
 from gsseg_core.export.pictures import legend, palette
 from gsseg_core.learn.registry import make_learner
@@ -199,3 +199,19 @@ def test_probabilities_of_a_source_that_tells_the_largest_only_are_completed() -
     told = np.array([[0.6, 0, 0], [0, 0, 0], [0.2, 0.3, 0.5]], np.float32)
     whole = completed(CSRRows.from_dense(told), 3).dense(3)
     np.testing.assert_allclose(whole, [[0.6, 0.2, 0.2], [0, 0, 0], [0.2, 0.3, 0.5]], rtol=1e-6)
+
+
+@pytest.mark.parametrize(("name", "label"), [("_background_", 0), ("Background", 0), ("__ignore__", UNKNOWN)])
+def test_a_category_of_coco_that_is_no_object_by_its_name_is_none_whatever_its_id(
+    tmp_path: Path, name: str, label: int
+) -> None:
+    data = write_dataset(tmp_path / "data")
+    view = Dataset(data).views()[0]
+    image = {"id": 1, "file_name": f"{view.name}.png", "width": view.camera.width, "height": view.camera.height}
+    of_all = [[0, 0, image["width"], 0, image["width"], image["height"], 0, image["height"]]]
+    categories = [{"id": 7, "name": name}, {"id": 9, "name": "mug"}]
+    annotation = {"image_id": 1, "category_id": 7, "segmentation": of_all}
+    whole = {"images": [image], "annotations": [annotation], "categories": categories}
+    (data / "coco.json").write_text(json.dumps(whole))
+    dataset = Dataset(data, "coco.json")
+    assert dataset.class_names == {0: "background", 9: "mug"} and (dataset.views()[0].read_labels() == label).all()

@@ -50,7 +50,7 @@ def read_coco(place: Place) -> MaskSet:
     views = {
         view: ViewMask.of(Drawing(*size, shapes[image_id]), where) for image_id, (view, where, size) in images.items()
     }
-    return MaskSet(views, {labels[i]: name for i, name in names.items() if labels[i]})
+    return MaskSet(views, {labels[i]: name for i, name in names.items() if labels[i] > 0})
 
 
 def segmentation(annotation: Record, width: int, height: int) -> Region:

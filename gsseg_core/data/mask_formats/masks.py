@@ -17,8 +17,7 @@ from gsseg_core.files.limits import MAX_LABEL
 from gsseg_core.scene.camera import Camera
 from gsseg_core.text import quoted
 
-_BACKGROUND = (BACKGROUND_NAME, "_background_", "__background__")
-_IGNORED = "__ignore__"
+_NO_OBJECTS = {**dict.fromkeys((BACKGROUND_NAME, "_background_", "__background__"), 0), "__ignore__": UNKNOWN}
 
 
 @dataclass(frozen=True, eq=False)
@@ -72,9 +71,9 @@ def number_names(names: Iterable[str], where: str) -> dict[str, int]:
 
     Raises `MaskFormatError` where there are more names than labels.
     """
-    numbers = {**dict.fromkeys(_BACKGROUND, 0), _IGNORED: UNKNOWN}
+    numbers = dict(_NO_OBJECTS)
     for name in names:
-        numbers.setdefault(name, len(numbers) - len(_BACKGROUND))
+        numbers.setdefault(name, len(numbers) - len(_NO_OBJECTS) + 1)
     if len(numbers) > MAX_LABEL:
         raise MaskFormatError(f"{where}: has {len(numbers):,} classes; expected at most {MAX_LABEL:,}")
     return numbers
@@ -86,9 +85,12 @@ def names_of(numbers: Mapping[str, int]) -> dict[int, str]:
 
 
 def ids_from_zero(names: Mapping[int, str]) -> dict[int, int]:
-    """Labels by id for a format in which 0 may be an object: one more than the id if it is, else the id itself."""
-    shift = 1 if 0 in names and names[0].lower() not in _BACKGROUND else 0
-    return {i: i + shift for i in names}
+    """Labels by id for a format in which 0 may be an object: one more than the id if it is, else the id itself.
+
+    As with `number_names`, the background is 0, and `__ignore__` unknown, whatever its id.
+    """
+    shift = 1 if 0 in names and names[0].lower() not in _NO_OBJECTS else 0
+    return {i: _NO_OBJECTS.get(name.lower(), i + shift) for i, name in names.items()}
 
 
 def check_name(name: object, where: str) -> str:
