@@ -199,11 +199,12 @@ def evaluate_folders(pred_dir: str | Path, truth_dir: str | Path, cameras: Itera
     """
     pred_dir, truth_dir, predictions = Path(pred_dir), Path(truth_dir), predicted_maps(pred_dir)
     from gsseg_core.data.mask_files import masks_below  # They load numba, which is of no use to anybody else here.
+    from gsseg_core.data.mask_formats.place import Place
     from gsseg_core.data.view import View
 
     known = {camera.name: camera for camera in cameras}
     images = [known[path.stem].image if path.stem in known else path.stem for path in predictions]
-    truths = masks_below(truth_dir, images)
+    truths = masks_below(Place(truth_dir, frozenset(images)))
     missing = [f"{image}.png" for image in images if image not in truths]
     if missing:
         raise MaskFormatError(

@@ -32,6 +32,7 @@ def run(options: argparse.Namespace) -> int:
     """Score, and print a table."""
     from gsseg_core.data.camera_files import find_cameras, read_cameras
     from gsseg_core.data.class_names import read_classes
+    from gsseg_core.data.mask_formats.place import Place
     from gsseg_core.data.mask_formats.table import open_masks
     from gsseg_core.errors import ClassesFileError, SettingsError
     from gsseg_core.files.atomic import check_replaceable, check_writable
@@ -48,7 +49,7 @@ def run(options: argparse.Namespace) -> int:
     names = read_classes(classes) if is_there(classes, ClassesFileError) else None
     cameras = read_cameras(root) if find_cameras(root) else []
     images = [camera.image for camera in cameras] or [path.stem for path in predicted_maps(options.pred)]
-    masks = open_masks(Path(options.truth), images)
+    masks = open_masks(Place(Path(options.truth), frozenset(images)))
     if masks is None:
         evaluation = evaluate_folders(options.pred, options.truth, cameras)
     elif masks.per_view:

@@ -17,7 +17,7 @@ from gsseg_core.data.label_images import GLOBAL, PER_VIEW
 from gsseg_core.data.label_map import read_label_map
 from gsseg_core.data.mask_files import masks_below, read_supervises
 from gsseg_core.data.mask_formats.masks import MaskSet
-from gsseg_core.data.mask_formats.place import SUPERVISES, possible_stems, view_of
+from gsseg_core.data.mask_formats.place import Place, possible_stems, view_of
 from gsseg_core.data.mask_formats.table import LABEL_IMAGES, open_masks
 from gsseg_core.data.view import View
 from gsseg_core.errors import ClassesFileError, GssegError, MaskFormatError, SettingsError, SplitFileError
@@ -83,10 +83,10 @@ class Dataset:
         classes = self.root / "classes.json"
         self._declared = read_classes(classes, self._within) if is_there(classes, ClassesFileError) else None
         self._views = {camera.name: View(camera, within=self._within) for camera in self.cameras}
-        images = [camera.image for camera in self.cameras]
-        self.masks = open_masks(self.root / labels, images, self._within)
+        place = Place(self.root / labels, frozenset(camera.image for camera in self.cameras), self._within)
+        self.masks = open_masks(place)
         if self.masks is None:
-            self._take_own_masks(self.root / labels, images)
+            self._take_own_masks(place)
         else:
             self._take_masks(self.masks)
         photo = self._photos(list_folder) or self._photos(list_below)
@@ -103,10 +103,10 @@ class Dataset:
         stems = ((possible_stems(str(path.relative_to(folder).with_suffix(""))), path) for path in photos)
         return {name: path for stems_of_path, path in stems for name in stems_of_path if name in names}
 
-    def _take_own_masks(self, folder: Path, images: list[str]) -> None:
+    def _take_own_masks(self, place: Place) -> None:
         """Find the masks of images, by their stems, in gsseg's own forms."""
-        masks = masks_below(folder, images, self._within)
-        supervised = read_supervises(folder / SUPERVISES, masks, images, self._declared, self._within)
+        masks = masks_below(place)
+        supervised = read_supervises(place, masks, self._declared)
         self._change_views(
             lambda view: {"mask_path": masks.get(view.camera.image), "supervised": supervised.get(view.camera.image)}
         )

@@ -16,7 +16,7 @@ from pathlib import Path
 from gsseg_core.data.camera_formats.table import CAMERA_FORMATS
 from gsseg_core.data.label_images import mask_header
 from gsseg_core.data.mask_files import mask_files, masks_below
-from gsseg_core.data.mask_formats.place import SUPERVISES
+from gsseg_core.data.mask_formats.place import SUPERVISES, Place
 from gsseg_core.data.mask_formats.table import open_masks
 from gsseg_core.errors import GssegError
 from gsseg_core.files.input_files import READABLE_IMAGES, list_folder
@@ -82,7 +82,7 @@ def mask_hint(root: Path, labels: str, stems: Collection[str]) -> str:
     for_each = f"for each view, {labels}/{stem}/<class id>.png ({_MORE})"
     expected = f"label images as PNG, and probabilities as {stem}.npz or {stem}/<class id>.tif ({_MORE})"
     with suppress(GssegError, OSError):
-        if (masks := open_masks(folder, stems)) and all(mask.blank for mask in masks.views.values()):
+        if (masks := open_masks(Place(folder, frozenset(stems)))) and all(mask.blank for mask in masks.views.values()):
             return f"; {folder} lists {counted(len(masks.views), 'image')} of these names, and no shape in any of them"
     if classes := _folders_by_class(folder, stems):
         wrong = f"{labels}/ has a folder for each class, such as {classes[0].name}/"
@@ -110,17 +110,17 @@ def _masks_elsewhere(root: Path, labels: str, stems: Collection[str]) -> tuple[i
     """Count masks of the cameras' names in the place that has most of them; with its name, as `--labels` takes it."""
     below = (root / labels).resolve()
     outside = not below.is_relative_to(root.resolve())
-    counts = [
-        (len(_masks(mask_files, path, stems)) or _count_foreign(path, stems, depth), path)
-        for path, depth in _places_of_masks(root, labels, outside=outside).items()
-    ]
+    wanted, counts = frozenset(stems), []
+    for path, depth in _places_of_masks(root, labels, outside=outside).items():
+        there = Place(path, wanted, depth=depth)
+        counts.append((len(_masks(mask_files, there)) or _count_foreign(there), path))
     # A folder that was named may be one too high; what lies beside it is perhaps something else, as true masks are.
     count, place = max(
         counts, key=lambda found: (found[0] > 0 and below in found[1].resolve().parents, found[0]), default=(0, root)
     )
     if not count:
         return None
-    if (more := len(_masks(masks_below, place.parent, stems))) > count and place.parent != root:
+    if (more := len(_masks(masks_below, Place(place.parent, wanted)))) > count and place.parent != root:
         count, place = more, place.parent
     return count, str(place) if outside and place.is_relative_to(root / labels) else os.path.relpath(place, root)
 
@@ -178,10 +178,10 @@ def _stems(folder: Path) -> set[str]:
     return {path.stem for path in _entries(folder) if path.suffix.lower() in _MASKS}
 
 
-def _masks(finder: Callable[..., dict[str, Path]], folder: Path, stems: Collection[str]) -> list[Path]:
-    """List masks of the given stems, of every kind; none where the first label image is a photo."""
+def _masks(finder: Callable[[Place], dict[str, Path]], place: Place) -> list[Path]:
+    """List the masks of views, of every kind; none where the first label image is a photo."""
     with suppress(GssegError, OSError):
-        found = list(finder(folder, stems).values())
+        found = list(finder(place).values())
         images = [path for path in found if path.suffix.lower() == ".png"]
         if images:
             mask_header(images[0])
@@ -189,10 +189,10 @@ def _masks(finder: Callable[..., dict[str, Path]], folder: Path, stems: Collecti
     return []
 
 
-def _count_foreign(place: Path, stems: Collection[str], depth: int) -> int:
-    """Count the masks of the given stems that another program wrote, in folders of so many levels at most."""
+def _count_foreign(place: Place) -> int:
+    """Count the masks of views that another program wrote."""
     with suppress(GssegError, OSError):
-        masks = open_masks(place, stems, depth=depth)
+        masks = open_masks(place)
         return 0 if masks is None else sum(not mask.blank for mask in masks.views.values())
     return 0
 

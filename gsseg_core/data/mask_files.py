@@ -7,13 +7,13 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 from pathlib import Path
 
 import numpy as np
 import numpy.typing as npt
 
-from gsseg_core.data.mask_formats.place import view_of, views_below
+from gsseg_core.data.mask_formats.place import SUPERVISES, Place, view_of
 from gsseg_core.data.soft_masks import SeenLabels, check_forms, combine_detections, quantise
 from gsseg_core.errors import MaskFormatError, SupervisesFileError, UnknownLabelError
 from gsseg_core.files.input_files import is_there, list_folder, open_image
@@ -30,34 +30,33 @@ _UNKNOWN = "unknown"
 _ANY = "*"
 
 
-def mask_files(folder: Path, stems: Iterable[str], within: Path | None = None) -> dict[str, Path]:
+def mask_files(place: Place) -> dict[str, Path]:
     """Find the masks of views: `<stem>.png`, `<stem>.npz` or the folder `<stem>`; else a file by `view_of`.
 
-    Raises `MaskFormatError` where a view has two masks, `PathNotAllowedError` where the folder lies outside `within`.
+    Raises `MaskFormatError` where a view has two masks, `PathNotAllowedError` where it lies outside `Place.within`.
     """
     found: dict[str, Path] = {}
-    wanted, others = set(stems), []
-    for path in list_folder(folder, MaskFormatError, within):
+    others = []
+    for path in place.entries:
         is_folder = path.is_dir()
         stem = composed(path.name if is_folder else path.stem)
         if not is_folder and path.suffix.lower() not in (".png", ".npz"):
             continue
-        if stem in wanted:
+        if stem in place.stems:
             _add(found, stem, path)
         elif not is_folder:
             others.append(path)
     longer: dict[str, Path] = {}
     for path in others:
-        view = view_of(path.name, wanted)
+        view = view_of(path.name, place.stems)
         if view is not None and view not in found:
             _add(longer, view, path)
     return found | longer
 
 
-def masks_below(folder: Path, stems: Iterable[str], within: Path | None = None) -> dict[str, Path]:
-    """Find the masks of views, by `mask_files`, or, where there is none, by `views_below`."""
-    wanted = set(stems)
-    return mask_files(folder, wanted, within) or views_below(folder, wanted, (".png", ".npz"), within)
+def masks_below(place: Place) -> dict[str, Path]:
+    """Find the masks of views, by `mask_files`, or, where there is none, by `Place.views_below`."""
+    return mask_files(place) or place.views_below(".png", ".npz")
 
 
 def _add(found: dict[str, Path], stem: str, path: Path) -> None:
@@ -67,22 +66,19 @@ def _add(found: dict[str, Path], stem: str, path: Path) -> None:
 
 
 def read_supervises(
-    path: Path,
-    masks: Mapping[str, Path],
-    stems: Iterable[str],
-    class_names: Mapping[int, str] | None,
-    within: Path | None = None,
+    place: Place, masks: Mapping[str, Path], class_names: Mapping[int, str] | None
 ) -> dict[str, tuple[int, ...]]:
     """Read which classes were looked for in each label image: `{"*": [1, 3], "frame_0007": [2]}`; none without a file.
 
     The entry of "*" is for all label images without one of their own. Raises `SupervisesFileError` where the file is
     broken, or names a view without a camera, a mask that is no label image, or a class that there is not, and
-    `PathNotAllowedError` where it lies outside `within`.
+    `PathNotAllowedError` where it lies outside `Place.within`.
     """
+    path = place.path / SUPERVISES
     if not is_there(path, SupervisesFileError):
         return {}
-    content = read_object(path, SupervisesFileError, '{"*": [ids]} or stems and ids', within)
-    known, entries = {*stems, _ANY}, {}
+    content = read_object(path, SupervisesFileError, '{"*": [ids]} or stems and ids', place.within)
+    known, entries = {*place.stems, _ANY}, {}
     for stem, ids in content.items():
         flaw, of_stem = "", f"{quoted(stem)} has"
         if stem not in known:

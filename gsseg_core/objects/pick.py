@@ -33,6 +33,7 @@ from gsseg_core.data.class_names import class_ids, listed
 from gsseg_core.data.label_images import UNKNOWN
 from gsseg_core.data.mask_files import CLASS_ID, masks_below
 from gsseg_core.data.mask_formats.images import read_label_image
+from gsseg_core.data.mask_formats.place import Place
 from gsseg_core.data.mask_formats.table import open_masks
 from gsseg_core.data.view import View
 from gsseg_core.errors import MaskFormatError, NoUsableViewsError, SettingsError
@@ -157,9 +158,10 @@ def read_object_mask(
     shape, or nothing in it is the object; `SettingsError` where there is no such class.
     """
     path, names = Path(path), class_names
-    masks = None if path.suffix.lower() == ".png" else open_masks(path, [camera.image])
+    place = Place(path, frozenset([camera.image]))
+    masks = None if path.suffix.lower() == ".png" else open_masks(place)
     if masks is None:
-        path = masks_below(path, [camera.image]).get(camera.image, path) if path.is_dir() else path
+        path = masks_below(place).get(camera.image, path) if path.is_dir() else path
         labels = read_label_image(path, camera)
     else:
         names, labels = masks.class_names, masks.views[camera.image].labels(camera)

@@ -21,7 +21,6 @@ from gsseg_core.data.mask_formats.place import Place
 from gsseg_core.data.mask_formats.record import Record, records
 from gsseg_core.data.mask_formats.shapes import Drawing, Polygons, Shape
 from gsseg_core.errors import MaskFormatError
-from gsseg_core.files.json_files import read_json
 from gsseg_core.scene.camera import Camera
 from gsseg_core.text import quoted
 
@@ -66,7 +65,7 @@ def _listed(place: Place) -> dict[int, str]:
 
 
 def _shapes(place: Place, path: Path) -> list[Record]:
-    return list(records(read_json(path, MaskFormatError, place.within), str(path), f"{path}, polygon"))
+    return list(records(place.json(path), str(path), f"{path}, polygon"))
 
 
 def _read_polygons(place: Place, path: Path, camera: Camera) -> npt.NDArray[np.int32]:

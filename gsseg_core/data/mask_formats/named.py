@@ -19,7 +19,6 @@ from gsseg_core.data.mask_formats.place import Place
 from gsseg_core.data.mask_formats.record import Record
 from gsseg_core.data.mask_formats.shapes import Drawing, Region, Shape
 from gsseg_core.errors import MaskFormatError
-from gsseg_core.files.json_files import read_json
 from gsseg_core.scene.camera import Camera
 
 
@@ -63,7 +62,7 @@ def read_named(place: Place, parse: Parser) -> MaskSet:
 
 
 def _open(place: Place, path: Path) -> Record:
-    return Record.of(read_json(path, MaskFormatError, place.within), str(path))
+    return Record.of(place.json(path), str(path))
 
 
 def _read(place: Place, path: Path, parse: Parser, numbers: dict[str, int], camera: Camera) -> npt.NDArray[np.int32]:

@@ -51,23 +51,6 @@ def possible_stems(name: str) -> list[str]:
     return ["_".join(parts[-count:]) for count in range(1, min(len(parts), 1 + _FOLDERS) + 1)]
 
 
-def views_below(
-    folder: Path, stems: Collection[str], suffixes: Iterable[str], within: Path | None, depth: int = _FOLDERS
-) -> dict[str, Path]:
-    """Find the files that belong to views in folders as their images are, `depth` levels down: `left/1.png`.
-
-    Where a view has several of those, they are something else, one for each class perhaps, and there is none.
-    """
-    found: dict[str, Path] = {}
-    for path in list_below(folder, MaskFormatError, within, depth):
-        view = view_of(str(path.relative_to(folder)), stems) if path.suffix.lower() in suffixes else None
-        if view in found:
-            return {}
-        if view is not None:
-            found[view] = path
-    return found
-
-
 @dataclass(frozen=True, eq=False)
 class Place:
     """The file or folder that `--labels` names; it and all below must lie in `within`, if that is given."""
@@ -80,8 +63,8 @@ class Place:
 
     @cached_property
     def entries(self) -> list[Path]:
-        """Files and folders in it, by `list_folder`, without gsseg's own `supervises.json`; none if it is a file."""
-        return [path for path in list_folder(self.path, MaskFormatError, self.within) if path.name != SUPERVISES]
+        """Files and folders in it, by `listed`, without gsseg's own `supervises.json`; none if it is a file."""
+        return [path for path in self.listed(self.path) if path.name != SUPERVISES]
 
     @property
     def folders(self) -> list[Path]:
@@ -107,7 +90,21 @@ class Place:
             return dict.fromkeys(self.stems, self.path)
         if self._has_masks:
             return self.views(((path.name, path) for path in files), self.path)
-        return views_below(self.path, self.stems, (suffix,), self.within, self.depth)
+        return self.views_below(suffix)
+
+    def views_below(self, *suffixes: str) -> dict[str, Path]:
+        """Find the files that belong to views in folders as their images are, `depth` levels down: `left/1.png`.
+
+        Where a view has several of those, they are something else, one for each class perhaps, and there is none.
+        """
+        found: dict[str, Path] = {}
+        for path in list_below(self.path, MaskFormatError, self.within, self.depth):
+            view = view_of(str(path.relative_to(self.path)), self.stems) if path.suffix.lower() in suffixes else None
+            if view in found:
+                return {}
+            if view is not None:
+                found[view] = path
+        return found
 
     @cached_property
     def _has_masks(self) -> bool:
@@ -138,7 +135,7 @@ class Place:
         """
         path, content = self.path, None
         for path in self.by_view(".json").values() or filter(None, [self.only(".json")]):
-            content = read_json(path, MaskFormatError, self.within)
+            content = self.json(path)
             if content != []:
                 break
         return path, content
@@ -160,6 +157,14 @@ class Place:
         """Tell whether a file begins with a pattern, a regular expression, within its first 4096 bytes."""
         with open_expected(path, MaskFormatError, within=self.within) as file:
             return re.match(pattern, file.read(_PEEKED)) is not None
+
+    def listed(self, folder: Path) -> list[Path]:
+        """List what is in a folder, by `list_folder`."""
+        return list_folder(folder, MaskFormatError, self.within)
+
+    def json(self, path: Path) -> object:
+        """Read a JSON file, by `read_json`."""
+        return read_json(path, MaskFormatError, self.within)
 
     def read(self, path: Path) -> bytes:
         """Read a file; `MaskFormatError` if it cannot be read, or is larger than any such file is."""

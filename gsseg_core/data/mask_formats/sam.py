@@ -24,7 +24,6 @@ from gsseg_core.data.mask_formats.rle import run_lengths
 from gsseg_core.data.mask_formats.shapes import Drawing, Nested, Runs, Shape
 from gsseg_core.errors import GssegError, MaskFormatError
 from gsseg_core.files.input_files import check_pixels
-from gsseg_core.files.json_files import read_json
 from gsseg_core.scene.camera import Camera
 from gsseg_core.text import quoted
 
@@ -99,7 +98,7 @@ def _share_of_json(place: Place, path: Path) -> float:
 
 def _opened(place: Place, path: Path) -> Drawing | None:
     """Read the masks of an image; None where nothing was found in it."""
-    content = read_json(path, MaskFormatError, place.within)
+    content = place.json(path)
     return None if content == [] else _drawing(path, content)
 
 

@@ -18,7 +18,6 @@ from gsseg_core.data.mask_formats.images import drawing_of_objects
 from gsseg_core.data.mask_formats.masks import MaskSet, ViewMask
 from gsseg_core.data.mask_formats.place import Place
 from gsseg_core.errors import MaskFormatError
-from gsseg_core.files.input_files import list_folder
 from gsseg_core.files.limits import MAX_LABEL
 from gsseg_core.scene.camera import Camera
 
@@ -55,7 +54,7 @@ def _objects(place: Place) -> dict[int, dict[str, Path]]:
     """Masks by view, by object; without objects that no view shows."""
     found = {}
     for folder in place.folders:
-        files = (path for path in list_folder(folder, MaskFormatError, place.within) if path.suffix.lower() == ".png")
+        files = (path for path in place.listed(folder) if path.suffix.lower() == ".png")
         if masks := place.views(((path.name, path) for path in files), folder):
             found[int(folder.name)] = masks
     return found

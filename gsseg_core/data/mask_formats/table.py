@@ -6,7 +6,7 @@ gsseg's own masks, a label image, probabilities or detections per view, are not 
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Mapping
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import partial
@@ -28,7 +28,7 @@ from gsseg_core.data.mask_formats.sam import METADATA, is_sam_folder, is_sam_jso
 from gsseg_core.data.mask_formats.sam2 import is_sam2, read_sam2
 from gsseg_core.data.mask_formats.yolo import is_yolo, read_yolo
 from gsseg_core.errors import MaskFormatError
-from gsseg_core.files.input_files import list_folder, reason
+from gsseg_core.files.input_files import reason
 from gsseg_core.text import quoted
 
 
@@ -47,7 +47,7 @@ class MaskFormat:
     looked_for: str
     ids: str
     on_top: str
-    own: Callable[[Path, frozenset[str], Path | None], Mapping[str, Path]] = masks_below
+    own: Callable[[Place], Mapping[str, Path]] = masks_below
 
 
 LABEL_IMAGES = "label images"
@@ -92,7 +92,7 @@ MASK_FORMATS = [
     ),
     MaskFormat(
         "EISeg", is_eiseg, read_eiseg, "`<stem>.png` or `<stem>.json`, and `autosave_label.txt`",
-        "those of the labels", "the last polygon", own=lambda *_: {},  # It has label images itself.
+        "those of the labels", "the last polygon", own=lambda place: {},  # It has label images itself.
     ),
 ]  # fmt: skip
 """All formats; a new one is added here."""
@@ -107,23 +107,20 @@ _FOREIGN = [
 ]
 
 
-def open_masks(
-    path: Path, stems: Iterable[str], within: Path | None = None, depth: int = Place.depth
-) -> MaskSet | None:
+def open_masks(place: Place) -> MaskSet | None:
     """Open the masks of another program, recognised by what they hold; None for gsseg's own, or where there are none.
 
-    Files of views may lie in folders as their images do, `depth` levels down.
-
     Raises `MaskFormatError` where they are of no known format, or may be of several, are broken, or of no view;
-    `PathNotAllowedError` where they lie outside `within`; `SettingsError` where a library is needed and not installed.
+    `PathNotAllowedError` where they lie outside `Place.within`; `SettingsError` where a library that is needed is not
+    installed.
     """
-    place = Place(path, frozenset(stems), within, depth)
+    path = place.path
     try:
         if not path.exists():
             return None
         found = [known for known in MASK_FORMATS if known.recognise(place)]
         names = [known.name for known in found]
-        own = (file for known in found for file in known.own(path, place.stems, within).values())
+        own = (file for known in found for file in known.own(place).values())
         if any(_is_own(file, place) for file in own):  # Photos beside annotations are none.
             names.append(LABEL_IMAGES)
         if len(names) > 1:
@@ -171,14 +168,13 @@ def _unknown(place: Place) -> Path | None:
     if not place.path.is_dir():
         return place.path
     described = next(iter([*place.by_view(".json").values(), *place.by_view(".txt").values()]), None)
-    return None if described is None or masks_below(place.path, place.stems, place.within) else described
+    return None if described is None or masks_below(place) else described
 
 
 def _is_own(path: Path, place: Place) -> bool:
     """Whether what has the name of a view is a mask of gsseg's own kinds."""
     if path.is_dir():
-        files = list_folder(path, MaskFormatError, place.within)
-        ids = [file.stem for file in files if file.suffix.lower() in DETECTIONS]
+        ids = [file.stem for file in place.listed(path) if file.suffix.lower() in DETECTIONS]
         return not (path / METADATA).exists() and any(re.fullmatch(CLASS_ID, stem) for stem in ids)
     with suppress(MaskFormatError):
         return path.suffix.lower() == ".npz" or bool(mask_header(path, place.within))
