@@ -94,8 +94,7 @@ def _hull(solid: Ellipsoids) -> TriangleMesh | None:
     """Convex hull of the ends of all axes; None where they have no volume."""
     from scipy.spatial import ConvexHull, QhullError
 
-    axes = solid.half_axes.transpose(0, 2, 1)
-    ends = np.concatenate([solid.means[:, None] + sign * axes for sign in (1, -1)]).reshape(-1, 3)
+    ends = solid.ends
     try:
         hull = ConvexHull(ends.astype(np.float64))
     except QhullError:

@@ -4,7 +4,8 @@ Gaussians have no normals, so these are made first. A Gaussian's *free direction
 which it is seen past the others, and its normal is that direction as the Gaussian's shape turns it, towards its thin
 axis: Sigma^-1 d. The rest is as in Kazhdan, Bolitho & Hoppe, *Poisson surface reconstruction* (2006), on a regular
 grid, where the equation is a division in the frequency domain: the function whose gradient is nearest to the normals is
-high inside and low outside, and the surface is where it has the mean of its values at the Gaussians.
+high inside and low outside, and the surface is where it has the mean of its values at the Gaussians. Where nobody
+looked, it may bulge; it ends at the convex hull.
 """
 
 from __future__ import annotations
@@ -23,6 +24,7 @@ _DISC, _RADIUS = 32, 0.7  # samples of a Gaussian's disc; its radius, of the ell
 _SMOOTH = 1.0  # voxels, standard deviation by which normals are smoothed
 _DENSITY = 2.0  # voxels, standard deviation over which the area of discs is added up, for all to weigh the same
 _APART = 1e-2  # of the range of values: no voxel's value is nearer to the level
+_SLOPE = 0.1  # of the range of values, per voxel: how they fall towards the convex hull
 _HELD = 0.5  # least share of the Gaussians inside a surface; one with fewer is not theirs
 
 
@@ -31,6 +33,12 @@ class Ellipsoids(NamedTuple):
 
     means: npt.NDArray[np.float32]  # (M, 3)
     half_axes: npt.NDArray[np.float32]  # (M, 3, 3): one in each column
+
+    @property
+    def ends(self) -> npt.NDArray[np.float32]:
+        """Both ends of all axes, (6 M, 3)."""
+        axes = self.half_axes.transpose(0, 2, 1)
+        return np.concatenate([self.means[:, None] + sign * axes for sign in (1, -1)]).reshape(-1, 3)
 
 
 class Voxels(NamedTuple):
@@ -45,6 +53,10 @@ class Voxels(NamedTuple):
         """Find the voxels that points (..., 3) are in: their indices."""
         found = np.floor((points - self.low) / self.size).astype(np.int64) + self.margin
         return tuple(np.moveaxis(np.clip(found, 0, np.array(self.filled.shape) - 1), -1, 0))
+
+    def middles(self, chosen: npt.NDArray[np.bool_]) -> npt.NDArray[np.floating]:
+        """Find the middles (V, 3) of chosen voxels (X, Y, Z)."""
+        return (np.argwhere(chosen) - self.margin + 0.5) * self.size + self.low
 
     def mesh(self, solid: npt.NDArray[np.bool_], values: npt.NDArray[np.floating], level: float) -> TriangleMesh:
         """Make a mesh around solid voxels (X, Y, Z), where values, high inside, cross a level beside them.
@@ -66,7 +78,12 @@ def poisson_surface(ellipsoids: Ellipsoids, voxels: Voxels) -> TriangleMesh | No
     It goes through those ends of ellipsoids that point outwards.
     """
     from scipy import ndimage
+    from scipy.spatial import ConvexHull, QhullError
 
+    try:
+        planes = ConvexHull(ellipsoids.ends.astype(np.float64)).equations
+    except QhullError:
+        return None
     (means, half_axes), normals = ellipsoids, _normals(ellipsoids, voxels)
     seen = np.flatnonzero(np.abs(normals).max(axis=1) > 0)
     if not len(seen):
@@ -93,13 +110,18 @@ def poisson_surface(ellipsoids: Ellipsoids, voxels: Voxels) -> TriangleMesh | No
     beyond[(slice(voxels.margin // 2, -voxels.margin // 2),) * 3] = False
     if solid[beyond].any() or ndimage.binary_dilation(solid)[voxels.cells(means)].mean() < _HELD:
         return None
+    places, depth = voxels.middles(solid).T.copy(), np.full(np.count_nonzero(solid), np.inf)  # (3, V), (V,)
+    for plane in planes:
+        np.minimum(depth, (-plane[:3] @ places - plane[3]) / voxels.size, out=depth)
+    inside[solid] = np.minimum(inside[solid], level + _SLOPE * float(np.ptp(inside)) * depth)
+    solid[solid] = depth > 0
     return voxels.mesh(solid, inside, level)
 
 
 def _normals(ellipsoids: Ellipsoids, voxels: Voxels) -> npt.NDArray[np.float64]:
     """Find unit normals (M, 3), outwards; 0 for a Gaussian that is seen from nowhere."""
     means, half_axes = ellipsoids
-    solid = (np.argwhere(voxels.filled) - voxels.margin + 0.5) * voxels.size + voxels.low
+    solid = voxels.middles(voxels.filled)
     cell, free = _PIXEL * voxels.size, np.zeros(means.shape)
     for direction in sphere(_DIRECTIONS):
         across = np.linalg.svd(direction[None])[2][1:]  # (2, 3)

@@ -201,6 +201,17 @@ def test_a_poisson_surface_closes_a_box_without_a_bottom_and_leaves_a_bowl_hollo
         assert closed.is_watertight and closed.body_count == 1 and closed.volume == pytest.approx(volume, rel=0.1)
 
 
+def test_a_poisson_surface_of_a_table_stays_within_its_hull() -> None:
+    points = np.random.default_rng(0).uniform(-1, 1, (3200, 3)) * (1, 1, 0.02)
+    legs = points[:800] * (0.04, 0.04, 25)
+    corners = np.array([[-0.9, -0.9], [-0.9, 0.9], [0.9, -0.9], [0.9, 0.9]])
+    legs[:, :2] += corners[np.arange(800) % 4]
+    table = shells(np.concatenate([points, legs - (0, 0, 0.5)]), 0.03)
+    hull, mesh = (meshes_in(*table, kind)[1].points for kind in (HULL, POISSON))
+    voxel = np.ptp(hull, axis=0).max() / 64
+    assert (mesh.min(axis=0) > hull.min(axis=0) - voxel).all() and (mesh.max(axis=0) < hull.max(axis=0) + voxel).all()
+
+
 def test_a_point_is_in_the_voxel_around_it_below_the_lowest_ellipsoid_too() -> None:
     voxels = Voxels(np.zeros((9, 9, 9), bool), np.float32([1, 2, 3]), 0.5, margin=4)
     places = np.argwhere(~voxels.filled)
