@@ -91,7 +91,7 @@ def run_demo(out: Path, nodes: ChildNodes, *, seed: int = 0, rate: float = 10.0,
             f"{percent(scores['mean_iou'])}, mAcc {percent(scores['mean_accuracy'])}, boundary IoU "
             f"{percent(scores['mean_boundary_iou'])}",
             f"Look at: {out}/masks_and_result.png and {out}/rendered/overlays/contact_sheet.png\n"
-            f"Objects: {out}/segmented/classes, PLYs for any 3DGS viewer\n"
+            f"Objects: {out}/segmented/classes, PLYs for 3DGS viewers\n"
             f"Logs of the nodes: {out}/logs",
         ]
     )

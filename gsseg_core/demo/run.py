@@ -46,7 +46,7 @@ def run_demo(out: str | os.PathLike[str], *, seed: int = 0, progress: Progress =
             f"{counted(scores['views'], 'other')} against the truth: mIoU {percent(scores['mean_iou'])}, "
             f"mAcc {percent(scores['mean_accuracy'])}, boundary IoU {percent(scores['mean_boundary_iou'])}",
             f"Look at: {out}/segmented/report.html and {out}/rendered/overlays\n"
-            f"Objects: {out}/segmented/classes, PLYs for any 3DGS viewer",
+            f"Objects: {out}/segmented/classes, PLYs for 3DGS viewers",
         ]
     )
 
