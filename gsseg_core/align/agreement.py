@@ -247,7 +247,12 @@ class _Window(NamedTuple):
         margin = _EDGE_PX * 2 * reach * focal / side
         columns, rows = ((centres > margin) & (centres < size - margin)).T
         seen = rows[:, None] & columns[None]
-        return cls(replace(camera, width=side, height=side, K=K), (*corners[0], *corners[1]), seen)
+        window = cls(replace(camera, width=side, height=side, K=K), (*corners[0], *corners[1]), seen)
+        if camera.undistortion is None:
+            return window
+        reached = window.cut(Image.fromarray(camera.undistortion.reached), Image.Resampling.NEAREST)
+        around = sliding_window_view(np.pad(reached, _EDGE_PX), (2 * _EDGE_PX + 1, 2 * _EDGE_PX + 1))
+        return window._replace(seen=seen & around.all(axis=(2, 3)))
 
     def cut(self, image: Image.Image, resampling: Image.Resampling) -> np.ndarray:
         """Cut the square out of the camera's image, (S, S); black where it shows nothing."""

@@ -49,6 +49,11 @@ class Undistortion:
         (fx, fy), (cx, cy) = self.focal, self.principal
         return np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1]])
 
+    @property
+    def reached(self) -> npt.NDArray[np.bool_]:
+        """Which pixels of the view the image reaches, (height, width)."""
+        return _nearest_pixels(self) >= 0
+
     def sample(
         self,
         image: npt.NDArray[Any],  # (H, W, ...), of the lens

@@ -30,9 +30,11 @@ from gsseg_core.data.view import View, spread
 from gsseg_core.errors import AlignmentError
 from gsseg_core.export.view_pictures import background_image
 from gsseg_core.raster.backends import make_operator
-from gsseg_core.scene.camera import Camera
+from gsseg_core.scene.camera import Camera, undistorted_camera
 from gsseg_core.scene.gaussian_scene import GaussianScene
+from gsseg_core.scene.lens import MODELS_BY_NAME, Lens
 from gsseg_core.scene.similarity import Similarity
+from gsseg_core.scene.undistortion import undistortions
 
 SETTINGS = AlignSettings()
 DISTURBED = Similarity(2.7, Rotation.from_rotvec([0.5, 2.0, -1.0]).as_matrix(), np.array([3.0, -1.0, 4.0]))
@@ -131,6 +133,17 @@ def test_real_scenes_are_never_said_not_to_fit(real_data: Path) -> None:
         for shown in (views, [replace(view, image_path=None) for view in views if view.has_mask]):
             found = agreement(scene, look_at(shown, SETTINGS), SETTINGS)
             assert found is None or found.agrees, (name, found)
+
+
+def test_the_border_of_an_image_that_a_lens_bent_is_no_edge(tmp_path: Path) -> None:
+    lens = Lens(MODELS_BY_NAME["OPENCV"], 320, 320, (304.0, 304.0), (160.0, 160.0), (0.25, 0.3))  # like a pincushion
+    (undistortion,) = undistortions(lens)
+    assert undistortion.reached[149, 149] and not undistortion.reached[0, 0]
+    Image.new("RGB", (320, 320), "white").save(tmp_path / "white.png")
+    view = View(undistorted_camera("white", undistortion, np.eye(4)), image_path=tmp_path / "white.png")
+    (shown,) = look_at([view], SETTINGS)
+    assert shown.seen.mean() > 0.7 and shown.edges.max() > 0.5
+    assert shown.edges[shown.seen].max() < 0.1
 
 
 def test_views_that_show_nothing_are_not_judged(demo: Path, scene: GaussianScene, tmp_path: Path) -> None:
