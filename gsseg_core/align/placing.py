@@ -9,6 +9,8 @@ from functools import cached_property
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from gsseg_core.align.agreement import Agreement, Shown, agreement, far_off, look_at
 from gsseg_core.align.conventions import Alignment, find_convention
 from gsseg_core.align.features import PhotosInScene
@@ -24,6 +26,7 @@ from gsseg_core.scene.gaussian_scene import GaussianScene
 from gsseg_core.scene.similarity import Similarity
 
 _LOST = 4.0  # standard deviations of Gaussians by which float32 moves them where a scene has lost what photos show
+_LABELS = 5  # of a mask whose outlines tell where it belongs
 _CLOSE_PX = 1.0  # photos and renderings that are no farther apart lie upon each other
 
 
@@ -50,6 +53,7 @@ class Placed:
     dataparser: Path | None = None  # the file of nerfstudio that said where to, if there was one
     found: Found | None = None  # what was found, if that was asked for
     agreement: Agreement | None = None  # of scene and views, where it was looked at and views show anything
+    masks: Agreement | None = None  # of scene and masks, where photos agree and masks have labels enough
 
     @property
     def fits(self) -> bool:
@@ -76,6 +80,7 @@ class Placed:
         return {
             "dataparser": None if self.dataparser is None else str(self.dataparser),
             "agreement": None if self.agreement is None else vars(self.agreement),
+            "masks": None if self.masks is None else vars(self.masks),
             "alignment": None if self.found is None else self.found.as_dict(),
         }
 
@@ -104,7 +109,15 @@ def place(
     if align:
         aligned = find_alignment(scene, views, settings, device, progress)
         return Placed(dataset.moved(aligned.alignment.camera), file, aligned, aligned.agreement)
-    return Placed(dataset, file, None, agreement(scene, look_at(views, settings), settings, device) if check else None)
+    if not check:
+        return Placed(dataset, file)
+    seen, masks = agreement(scene, look_at(views, settings), settings, device), None
+    if seen and seen.agrees and seen.compared == "photos":
+        drawn = look_at([replace(view, image_path=None) for view in views], settings)
+        # Outlines of a few small things lie upon edges of colour by chance as often as not.
+        telling = [one for one in drawn if one.labels is not None and len(np.unique(one.labels)) >= _LABELS]
+        masks = agreement(scene, telling, settings, device)
+    return Placed(dataset, file, None, seen, masks)
 
 
 def find_alignment(

@@ -96,6 +96,8 @@ def frame_of(report: Mapping[str, Any], asked: str = "DATASET --scene SCENE") ->
         found = Agreement(**agreement)
         frames = f"the two may be in different frames; try --align, or gsseg doctor {asked}"
         told.append(found.nearness or (found.doubt and f"{found.doubt}: {frames}"))
+        if (masks := report["frame"].get("masks")) and masks["agrees"] is False:
+            told.append(f"{Agreement(**masks).doubt}, but as photos do: are masks of other views, or turned?")
     return [sentence for sentence in told if sentence]
 
 

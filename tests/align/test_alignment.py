@@ -324,6 +324,19 @@ def test_doctor_says_what_makes_cameras_fit_and_whether_they_did(
     assert "expected a dataset, too" in capsys.readouterr().err
 
 
+@pytest.mark.parametrize("turned", [False, True])
+def test_masks_that_do_not_belong_to_photos_that_fit_are_said_not_to(
+    turned: bool, demo: Path, with_photos: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    data = Path(shutil.copytree(with_photos, tmp_path / "data"))
+    for view in Dataset(demo).views("train"):
+        labels = view.read_labels()
+        write_mask(data / f"labels/{view.name}.png", labels[::-1, ::-1] if turned else labels, 8)
+    quick = ["--quiet", "--learner", "votes", "--no-knn", "--no-filter", "--out", str(tmp_path / "out")]
+    assert main(["segment", str(demo / "scene.ply"), "--data", str(data), *quick]) == 0
+    assert ("as the masks do from these cameras, but as photos do" in capsys.readouterr().err) == turned
+
+
 SMALL, FAR = "of what cameras look at is nearer to them than 0.01", "the scene is so far from its origin that float32"
 
 
