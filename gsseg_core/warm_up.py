@@ -48,6 +48,7 @@ FIRST_RUN = "compiling kernels, about a minute on two cores; only the first run 
 EVERY_RUN = (
     "compiling kernels, about a minute on two cores, as in every run: they cannot be kept; " + kernel_cache.REMEDY
 )
+NOT_KEPT = f"some kernels could not be kept, is the disk full? Every run compiles them; {kernel_cache.REMEDY}"
 
 SIDE = 72  # Gaussians on a side of the square; trees of fewer than 4,096 in all are built by other kernels
 
@@ -71,8 +72,8 @@ def warm_up(device: str = "cpu", say: Callable[[str], object] = lambda text: Non
     """Take some thousand Gaussians through everything that segmenting does, so that all its kernels are there.
 
     That takes a third of a second when they are in the cache, and about a minute on two cores at the first time after
-    an installation; then `say` is told, and a second process compiles beside this one. In a process that is warm,
-    nothing is done.
+    an installation; then `say` is told, and a second process compiles beside this one. It is told, too, if some could
+    not be kept. In a process that is warm, nothing is done.
     """
     if device in _warm:
         return
@@ -92,6 +93,8 @@ def warm_up(device: str = "cpu", say: Callable[[str], object] = lambda text: Non
         for process in beside:
             with process:
                 process.kill()
+    if kernel_cache.INCOMPLETE:
+        say(NOT_KEPT)
     _warm.add(device)
 
 

@@ -295,10 +295,11 @@ def _kernels(say: Callable[[str], object]) -> Iterator[Finding]:
     seconds = time.perf_counter() - start
     compiled = "from the cache" if add_pairs.stats.cache_hits else "compiled just now"
     yield Finding("kernels", "run", f"segmented {SIDE**2:,} Gaussians in {seconds:.1f} s, {compiled}")
-    if kernel_cache.FOLDER:
+    if kernel_cache.FOLDER and not kernel_cache.INCOMPLETE:
         yield Finding("kernels", "cache", add_pairs.stats.cache_path or kernel_cache.FOLDER)
     else:
-        state = f"none: cannot write to {' or '.join(kernel_cache.candidates())}"
+        folders = [kernel_cache.FOLDER] if kernel_cache.FOLDER else kernel_cache.candidates()
+        state = f"{'incomplete' if kernel_cache.FOLDER else 'none'}: cannot write to {' or '.join(folders)}"
         fix = f"{kernel_cache.REMEDY}; else every run compiles for about a minute on two cores"
         yield Finding("kernels", "cache", state, "-", fix)
 

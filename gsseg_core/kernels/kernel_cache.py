@@ -51,6 +51,9 @@ def writable(folder: str) -> bool:
 FOLDER: str | None = next(filter(writable, candidates()), None)
 """The folder that numba will take; None where it can write to none, so that each run compiles anew."""
 
+INCOMPLETE = False
+"""Whether a kernel could not be written to that folder, as on a disk that is full, so that each run compiles it."""
+
 
 def keep(kernel: Any, enable: Callable[[Any], None]) -> None:
     """Have a kernel kept from one run to the next, by what enables that of its kind, if it can be.

@@ -118,8 +118,10 @@ class _KernelCache(FunctionCache):
             return None
 
     def save_overload(self, sig: Any, data: Any) -> None:
-        with suppress(OSError):  # Where the disk is full, the next run compiles it once more.
+        try:
             super().save_overload(sig, data)
+        except OSError:
+            kernel_cache.INCOMPLETE = True
 
 
 def enable(kernel: Dispatcher[Any]) -> None:

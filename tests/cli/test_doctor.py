@@ -180,6 +180,13 @@ def test_doctor_reports_a_kernel_cache_that_cannot_be_written(monkeypatch: pytes
     assert found.mark == "-" and "NUMBA_CACHE_DIR" in found.fix and kernel_cache.candidates()[-1] in found.state
 
 
+def test_doctor_reports_a_kernel_cache_that_has_no_room_for_all_kernels(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(kernel_cache, "INCOMPLETE", True)
+    found = named(examine(), "cache")
+    assert found.mark == "-" and "NUMBA_CACHE_DIR" in found.fix
+    assert f"cannot write to {kernel_cache.FOLDER}" in found.state
+
+
 def test_doctor_reports_kernels_that_do_not_run(monkeypatch: pytest.MonkeyPatch) -> None:
     def broken(*_: object, **__: object) -> None:
         raise RuntimeError("no code for this processor")

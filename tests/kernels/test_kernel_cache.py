@@ -33,6 +33,7 @@ import numpy as np
 from gsseg_core.learn.em.rejected_regions import connected_pixels
 print(connected_pixels(np.zeros((2, 2), np.int32))[1].tolist(), sum(connected_pixels.stats.cache_hits.values()))
 """
+IS_INCOMPLETE = "from gsseg_core.kernels import kernel_cache; print(kernel_cache.INCOMPLETE)"
 # Without a GPU nothing is compiled: what its cache is asked for is all that there is of one.
 ONE_OF_THE_GPU = """
 from pathlib import Path
@@ -142,6 +143,21 @@ def test_a_disk_too_full_to_keep_a_kernel_does_not_end_the_run(tmp_path: Path) -
     kept.write_bytes(b"")
     done = run(environment, "-c", FULL_DISK + ONE_KERNEL)
     assert done.stdout == "[0] 0\n", done.stderr
+
+
+def test_a_kernel_that_could_not_be_kept_is_noted(tmp_path: Path) -> None:
+    environment = {**os.environ, "NUMBA_CACHE_DIR": str(tmp_path)}
+    for before, noted in ((FULL_DISK, True), ("", False)):
+        done = run(environment, "-c", before + ONE_KERNEL + IS_INCOMPLETE)
+        assert done.stdout == f"[0] 0\n{noted}\n", done.stderr
+
+
+def test_who_waited_is_told_that_some_kernels_could_not_be_kept(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(kernel_cache, "INCOMPLETE", True)
+    monkeypatch.setattr(warm_up, "_warm", set())
+    lines: list[str] = []
+    warm_up.warm_up(say=lines.append)
+    assert lines[-1] == warm_up.NOT_KEPT and "NUMBA_CACHE_DIR" in lines[-1]
 
 
 def test_only_trying_tells_whether_a_folder_can_be_written_to(tmp_path: Path) -> None:
