@@ -39,6 +39,7 @@ from gsseg_core.scene.undistortion import undistortions
 SETTINGS = AlignSettings()
 DISTURBED = Similarity(2.7, Rotation.from_rotvec([0.5, 2.0, -1.0]).as_matrix(), np.array([3.0, -1.0, 4.0]))
 PHOTOS = 8
+QUICK = ["--quiet", "--learner", "votes", "--no-knn", "--no-filter", "--views", "4", "--out"]
 
 
 @pytest.fixture(scope="module")
@@ -332,8 +333,7 @@ def test_masks_that_do_not_belong_to_photos_that_fit_are_said_not_to(
     for view in Dataset(demo).views("train"):
         labels = view.read_labels()
         write_mask(data / f"labels/{view.name}.png", labels[::-1, ::-1] if turned else labels, 8)
-    quick = ["--quiet", "--learner", "votes", "--no-knn", "--no-filter", "--out", str(tmp_path / "out")]
-    assert main(["segment", str(demo / "scene.ply"), "--data", str(data), *quick]) == 0
+    assert main(["segment", str(demo / "scene.ply"), "--data", str(data), *QUICK, str(tmp_path / "out")]) == 0
     assert ("as the masks do from these cameras, but as photos do" in capsys.readouterr().err) == turned
 
 
@@ -356,8 +356,7 @@ def test_that_a_scene_is_too_small_or_too_far_off_is_said_at_once_and_everywhere
     monkeypatch.setattr(placing._Search, "closer", lambda _, *found: Found(*found, found[1], 0.2))
     assert main(["doctor", str(data), "--scene", file, "--quiet"]) == exit_code
     assert said in "".join(capsys.readouterr())
-    quick = ["--quiet", "--learner", "votes", "--views", "4", "--no-knn", "--no-filter", "--out", str(tmp_path / "out")]
-    assert main(["segment", file, "--data", str(data), *quick]) == 0
+    assert main(["segment", file, "--data", str(data), *QUICK, str(tmp_path / "out")]) == 0
     assert said in capsys.readouterr().err and said[1:] in (tmp_path / "out/report.html").read_text()
 
 
@@ -366,8 +365,7 @@ def test_segment_warns_too_where_nobody_can_tell_whether_cameras_fit(
     demo: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(placing, "agreement", lambda *_: Agreement("masks", 6, 0.34, 0.28, None))
-    quick = ["--quiet", "--learner", "votes", "--views", "4", "--no-knn", "--no-filter", "--out", str(tmp_path / "out")]
-    assert main(["segment", str(demo / "scene.ply"), "--data", str(demo), *quick]) == 0
+    assert main(["segment", str(demo / "scene.ply"), "--data", str(demo), *QUICK, str(tmp_path / "out")]) == 0
     assert "hardly looks as the masks do from these cameras" in capsys.readouterr().err
 
 
@@ -378,13 +376,12 @@ def test_segment_warns_in_one_line_of_cameras_that_do_not_fit_and_align_mends_it
     turned = write_moved(demo, tmp_path / "turned", Convention(world_axes=AXIS_ROTATIONS[9]).camera)
     lost = write_moved(demo, tmp_path / "lost", DISTURBED.camera)
     scene = str(demo / "scene.ply")
-    quick = ["--quiet", "--learner", "votes", "--views", "4", "--no-knn", "--no-filter", "--out", str(tmp_path / "out")]
-    assert main(["segment", scene, "--data", str(lost), *quick]) == 0
+    assert main(["segment", scene, "--data", str(lost), *QUICK, str(tmp_path / "out")]) == 0
     assert capsys.readouterr().err.count("try --align") == 1
     assert "The scene does not look as the masks do from these cameras" in (tmp_path / "out/report.html").read_text()
     assert json.loads((tmp_path / "out/report.json").read_text())["frame"]["agreement"]["agrees"] is False
 
-    assert main(["segment", scene, "--data", str(turned), *quick, "--align"]) == 0
+    assert main(["segment", scene, "--data", str(turned), *QUICK, str(tmp_path / "out"), "--align"]) == 0
     assert capsys.readouterr().err == ""
     frame = json.loads((tmp_path / "out/report.json").read_text())["frame"]
     assert frame["agreement"]["agrees"] is True
