@@ -81,9 +81,10 @@ def collision_mesh(
     kind: str,
 ) -> TriangleMesh | None:
     """Make the mesh of one object, whose Gaussians are `ids`; None where it has no opaque Gaussian or no volume."""
-    index = ids[scene.opacities[ids] >= OPAQUE]
-    box = class_box(scene, ids, confidence[ids])
-    kept = index[(np.abs((scene.means[index] - box.center) @ box.axes) <= box.size / 2).all(axis=1)]
+    kept = ids[scene.opacities[ids] >= OPAQUE]
+    if len(kept):
+        box = class_box(scene, ids, confidence[ids])
+        kept = kept[(np.abs((scene.means[kept] - box.center) @ box.axes) <= box.size / 2).all(axis=1)]
     if not len(kept):
         return None
     make = {HULL: _hull, SURFACE: _surface, POISSON: _poisson}[kind]
@@ -92,19 +93,14 @@ def collision_mesh(
 
 def _hull(solid: Ellipsoids) -> TriangleMesh | None:
     """Convex hull of the ends of all axes; None where they have no volume."""
-    from scipy.spatial import ConvexHull, QhullError
-
-    ends = solid.ends
-    try:
-        hull = ConvexHull(ends.astype(np.float64))
-    except QhullError:
+    if (hull := solid.hull()) is None:
         return None
     triangles = np.searchsorted(hull.vertices, hull.simplices).astype(np.int32)
-    points = ends[hull.vertices]
+    points = hull.points[hull.vertices].astype(np.float32)
     a, b, c = (points[triangles[:, i]] for i in range(3))
     inwards = (np.cross(b - a, c - a) * hull.equations[:, :3]).sum(axis=1) < 0
     triangles[inwards] = triangles[inwards][:, ::-1]
-    return TriangleMesh(points.astype(np.float32), triangles, convex=True)
+    return TriangleMesh(points, triangles, convex=True)
 
 
 def _surface(solid: Ellipsoids) -> TriangleMesh | None:

@@ -10,12 +10,15 @@ looked, it may bulge; it ends at the convex hull.
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
 
 from gsseg_core.scene.triangle_mesh import TriangleMesh
+
+if TYPE_CHECKING:
+    from scipy.spatial import ConvexHull
 
 _DIRECTIONS = 96  # from which Gaussians are looked at
 _PIXEL, _BEHIND = 1.5, 2.0  # voxels: side of a pixel of these looks; depth behind the front that still counts as seen
@@ -34,11 +37,16 @@ class Ellipsoids(NamedTuple):
     means: npt.NDArray[np.float32]  # (M, 3)
     half_axes: npt.NDArray[np.float32]  # (M, 3, 3): one in each column
 
-    @property
-    def ends(self) -> npt.NDArray[np.float32]:
-        """Both ends of all axes, (6 M, 3)."""
+    def hull(self) -> ConvexHull | None:
+        """Find the convex hull of the ends of all axes; None where they have no volume."""
+        from scipy.spatial import ConvexHull, QhullError
+
         axes = self.half_axes.transpose(0, 2, 1)
-        return np.concatenate([self.means[:, None] + sign * axes for sign in (1, -1)]).reshape(-1, 3)
+        ends = np.concatenate([self.means[:, None] + sign * axes for sign in (1, -1)]).reshape(-1, 3)
+        try:
+            return ConvexHull(ends.astype(np.float64))
+        except QhullError:
+            return None
 
 
 class Voxels(NamedTuple):
@@ -78,11 +86,8 @@ def poisson_surface(ellipsoids: Ellipsoids, voxels: Voxels) -> TriangleMesh | No
     It goes through those ends of ellipsoids that point outwards.
     """
     from scipy import ndimage
-    from scipy.spatial import ConvexHull, QhullError
 
-    try:
-        planes = ConvexHull(ellipsoids.ends.astype(np.float64)).equations
-    except QhullError:
+    if (hull := ellipsoids.hull()) is None:
         return None
     (means, half_axes), normals = ellipsoids, _normals(ellipsoids, voxels)
     seen = np.flatnonzero(np.abs(normals).max(axis=1) > 0)
@@ -111,7 +116,7 @@ def poisson_surface(ellipsoids: Ellipsoids, voxels: Voxels) -> TriangleMesh | No
     if solid[beyond].any() or ndimage.binary_dilation(solid)[voxels.cells(means)].mean() < _HELD:
         return None
     places, depth = voxels.middles(solid).T.copy(), np.full(np.count_nonzero(solid), np.inf)  # (3, V), (V,)
-    for plane in planes:
+    for plane in hull.equations:
         np.minimum(depth, (-plane[:3] @ places - plane[3]) / voxels.size, out=depth)
     inside[solid] = np.minimum(inside[solid], level + _SLOPE * float(np.ptp(inside)) * depth)
     solid[solid] = depth > 0

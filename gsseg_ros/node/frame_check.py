@@ -20,8 +20,10 @@ class FrameCheck:
     def look(self, session: LiveSession, scene: GaussianScene, outcome: Outcome) -> str:
         """Compare a scene with the views that were learnt from; return what is wrong, empty if nothing is."""
         found = agreement(scene, look_at(outcome.views, _SETTINGS), _SETTINGS, session.device)
-        said = "" if found is None else found.nearness
-        if not said and found is not None and found.agrees is False:
+        said = ""
+        if found is not None and found.nearness:
+            said = found.nearness
+        elif found is not None and found.agrees is False:
             said = (
                 f"{found.doubt} ({found}): the two seem to be in different frames; expected poses of the camera's "
                 "optical frame (x right, y down, z forward) in map_frame, and scene_to_map to say where the scene lies "
