@@ -41,6 +41,7 @@ _SLOPE = np.arange(-_REACH, _REACH + 1, dtype=np.float32) * _BLUR  # of a blurre
 _WIDEST = 1e4  # tangent of half the field of view; a camera that claims more is broken
 _CUT = 0.01  # share of what cameras look at that may be too near to be drawn; of scenes of a usual size it is none
 ROUNDED = 0.5  # standard deviations of Gaussians that float32 may move them by; from there on labels get worse
+_LABELS = 5  # of a mask whose outlines tell where it belongs
 _NEAREST = 1e-3  # depth in scene units below which logarithms are not taken
 
 
@@ -64,6 +65,11 @@ class Shown:
     seen: np.ndarray  # (S, S) bool: pixels that lie in the view
     edges: np.ndarray  # (S, S) float32: edges of the photo, or outlines of the mask
     labels: np.ndarray | None = None  # (S, S) int32: regions of the mask, negative where unknown; not of a photo
+
+    @property
+    def telling(self) -> bool:
+        """Whether it tells of its place: outlines of a few small things lie upon edges by chance as often as not."""
+        return self.labels is None or len(np.unique(self.labels)) >= _LABELS
 
     def score(self, rendered: Rendered) -> float:
         """Compare with a rendering: 0 to 1."""
@@ -90,12 +96,15 @@ class Agreement:
     chance: float  # of pictures that do not belong together
     agrees: bool | None  # whether cameras and scene belong together; None where that is undecided
     too_near: float = 0.0  # share of the Gaussians in the views' pictures that are too near to be drawn
+    telling: bool = True  # whether views show enough to say that cameras and scene do not belong together
 
     @property
     def doubt(self) -> str:
         """Say in a sentence without its stop that cameras and scene may not belong together; "" where they do."""
         if self.agrees:
             return ""
+        if not self.telling:
+            return f"{self.compared} of so few labels cannot tell whether cameras and scene belong together"
         looks = "hardly looks" if self.agrees is None else "does not look"
         return f"the scene {looks} as the {self.compared} do from these cameras"
 
@@ -164,9 +173,10 @@ def agreement(
     chance = min(turned, float(scores[~own].mean())) if len(shown) > 1 else turned
     photos = shown[0].labels is None
     disagrees, agrees = settings.photo_margins if photos else settings.mask_margins
-    verdict = True if score - chance >= agrees else False if score - chance < disagrees else None
+    telling = any(view.telling for view in shown)
+    verdict = True if score - chance >= agrees else False if telling and score - chance < disagrees else None
     too_near = _too_near(few, [view.camera for view in shown])
-    return Agreement("photos" if photos else "masks", len(shown), score, chance, verdict, too_near)
+    return Agreement("photos" if photos else "masks", len(shown), score, chance, verdict, too_near, telling)
 
 
 def _too_near(scene: GaussianScene, cameras: Sequence[Camera]) -> float:

@@ -9,8 +9,6 @@ from functools import cached_property
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
 from gsseg_core.align.agreement import Agreement, Shown, agreement, far_off, look_at
 from gsseg_core.align.conventions import Alignment, find_convention
 from gsseg_core.align.features import PhotosInScene
@@ -26,7 +24,6 @@ from gsseg_core.scene.gaussian_scene import GaussianScene
 from gsseg_core.scene.similarity import Similarity
 
 _LOST = 4.0  # standard deviations of Gaussians by which float32 moves them where a scene has lost what photos show
-_LABELS = 5  # of a mask whose outlines tell where it belongs
 _CLOSE_PX = 1.0  # photos and renderings that are no farther apart lie upon each other
 
 
@@ -114,9 +111,7 @@ def place(
     seen, masks = agreement(scene, look_at(views, settings), settings, device), None
     if seen and seen.agrees and seen.compared == "photos":
         drawn = look_at([replace(view, image_path=None) for view in views], settings)
-        # Outlines of a few small things lie upon edges of colour by chance as often as not.
-        telling = [one for one in drawn if one.labels is not None and len(np.unique(one.labels)) >= _LABELS]
-        masks = agreement(scene, telling, settings, device)
+        masks = agreement(scene, [mask for mask in drawn if mask.labels is not None and mask.telling], settings, device)
     return Placed(dataset, file, None, seen, masks)
 
 

@@ -94,7 +94,10 @@ def frame_of(report: Mapping[str, Any], asked: str = "DATASET --scene SCENE") ->
     told, agreement = [far_off(report["scene"].get("rounding", 0.0))], report.get("frame", {}).get("agreement")
     if agreement:
         found = Agreement(**agreement)
-        frames = f"the two may be in different frames; try --align, or gsseg doctor {asked}"
+        doctor = f"gsseg doctor {asked}"
+        frames = f"the two may be in different frames; try --align, or {doctor}"
+        if not found.telling:
+            frames = f"look at rendered/overlays; with photos of the views in images/, {doctor} tells"
         told.append(found.nearness or (found.doubt and f"{found.doubt}: {frames}"))
         if (masks := report["frame"].get("masks")) and masks["agrees"] is False:
             told.append(f"{Agreement(**masks).doubt}, but as photos do: are masks of other views, or turned?")

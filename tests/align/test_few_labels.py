@@ -1,0 +1,37 @@
+"""Masks of an object or two, without photos: too little to say that cameras and scene do not belong together."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from gsseg_core.align.agreement import Agreement, agreement, look_at
+from gsseg_core.align.settings import AlignSettings
+from gsseg_core.data.dataset import Dataset
+from gsseg_core.data.view import View
+from gsseg_core.report.findings import frame_of
+from gsseg_core.scene.gaussian_scene import GaussianScene
+
+
+@pytest.mark.parametrize("shown", [(1,), (2,), (3, 5), tuple(range(1, 6))])
+def test_masks_of_few_labels_never_say_that_cameras_do_not_fit(demo_run: Path, shown: tuple[int, ...]) -> None:
+    data, scene = Dataset(demo_run / "scene"), GaussianScene.load(demo_run / "scene/scene.ply")
+    lost = np.diag([1.0, -1.0, -1.0, 1.0])
+    views = []
+    for view in data.views("train"):
+        labels = view.read_labels()
+        labels = np.where(np.isin(labels, shown), labels, 0).astype(np.int32)
+        camera = replace(view.camera, world_to_camera=lost @ view.camera.world_to_camera)
+        views.append(View.from_arrays(camera, labels))
+    found = agreement(scene, look_at(views, AlignSettings()), AlignSettings())
+    assert found is not None and found.telling == (len(shown) > 3)
+    assert found.agrees is (False if found.telling else None)
+
+
+def test_a_report_does_not_blame_cameras_for_masks_of_few_labels() -> None:
+    found = Agreement("masks", 6, 0.21, 0.2, None, telling=False)
+    (said,) = frame_of({"scene": {}, "frame": {"agreement": vars(found)}})
+    assert said.startswith("masks of so few labels cannot tell") and "--align" not in said
