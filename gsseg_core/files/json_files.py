@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+from collections import Counter
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -21,13 +22,24 @@ _KINDS = {
 
 
 def read_json(path: Path, error: type[GssegError], within: Path | None = None) -> object:
-    """Read a JSON file, below `within` if given; raise `error` if it is missing, broken, or larger than any is."""
+    """Read a JSON file, below `within` if given; raise `error` if it is missing, broken, or larger than any is.
+
+    An object with a key twice is broken: of two names that somebody gave a class, JSON's parser would keep the last.
+    """
     content = read_input(path, error, within)
     try:
         # Editors on Windows write a byte order mark, which "utf-8" would hand to the parser.
-        return json.loads(content.decode("utf-8-sig"))
+        return json.loads(content.decode("utf-8-sig"), object_pairs_hook=_with_each_key_once)
     except (ValueError, RecursionError) as cause:
         raise error(f"{path}: not valid JSON ({clipped(cause, 160)})") from cause
+
+
+def _with_each_key_once(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+    made = dict(pairs)
+    if len(made) < len(pairs):
+        twice = next(key for key, count in Counter(key for key, _ in pairs).items() if count > 1)
+        raise ValueError(f"{quoted(twice)} stands more than once in an object")
+    return made
 
 
 def read_object(path: Path, error: type[GssegError], expected: str, within: Path | None = None) -> dict[str, Any]:

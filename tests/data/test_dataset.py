@@ -322,9 +322,12 @@ def test_broken_splits_are_refused(tmp_path: Path, content: str, message: str) -
         Dataset(tmp_path)
 
 
-def test_broken_classes_are_refused_when_the_dataset_is_opened(tmp_path: Path) -> None:
-    (make_dataset(tmp_path) / "classes.json").write_text("{")
-    with pytest.raises(ClassesFileError, match=r"classes\.json: not valid JSON"):
+@pytest.mark.parametrize(
+    ("content", "flaw"), [("{", ""), ('{"1": "mug", "2": "jug", "1": "cup"}', "'1' stands more than once in an object")]
+)
+def test_broken_classes_are_refused_when_the_dataset_is_opened(tmp_path: Path, content: str, flaw: str) -> None:
+    (make_dataset(tmp_path) / "classes.json").write_text(content)
+    with pytest.raises(ClassesFileError, match=rf"classes\.json: not valid JSON \({flaw}"):
         Dataset(tmp_path)
 
 
