@@ -138,6 +138,12 @@ def find_alignment(
     told = far_off(scene.rounding) if scene.rounding >= _LOST else "" if before.agrees else before.nearness
     if told:  # To search takes minutes, and finds nothing.
         raise AlignmentError(f"alignment: {told}")
+    if not before.telling:  # Among all conventions, one agrees by chance.
+        if before.agrees:
+            return Found(Alignment(), before, before)
+        raise AlignmentError(
+            f"alignment: {before.doubt} ({before}); expected photos of the views in images/, or masks of more objects"
+        )
     search, agreeing = _Search(scene, views, shown, before, settings, device), list[Found]()
     # Masks say less than photos do: the regions of a shelf may agree from a wrong side, too.
     if before.agrees and search.has_photos:

@@ -97,7 +97,7 @@ def frame_of(report: Mapping[str, Any], asked: str = "DATASET --scene SCENE") ->
         doctor = f"gsseg doctor {asked}"
         frames = f"the two may be in different frames; try --align, or {doctor}"
         if not found.telling:
-            frames = f"look at rendered/overlays; with photos of the views in images/, {doctor} tells"
+            frames = f"look at the pictures; with photos of the views in images/, {doctor} tells"
         told.append(found.nearness or (found.doubt and f"{found.doubt}: {frames}"))
         if (masks := report["frame"].get("masks")) and masks["agrees"] is False:
             told.append(f"{Agreement(**masks).doubt}, but as photos do: are masks of other views, or turned?")

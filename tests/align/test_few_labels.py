@@ -4,14 +4,18 @@ from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path
+from unittest.mock import patch
 
 import numpy as np
 import pytest
 
+from gsseg_core.align import placing
 from gsseg_core.align.agreement import Agreement, agreement, look_at
+from gsseg_core.align.placing import find_alignment
 from gsseg_core.align.settings import AlignSettings
 from gsseg_core.data.dataset import Dataset
 from gsseg_core.data.view import View
+from gsseg_core.errors import AlignmentError
 from gsseg_core.report.findings import frame_of
 from gsseg_core.scene.gaussian_scene import GaussianScene
 
@@ -29,6 +33,19 @@ def test_masks_of_few_labels_never_say_that_cameras_do_not_fit(demo_run: Path, s
     found = agreement(scene, look_at(views, AlignSettings()), AlignSettings())
     assert found is not None and found.telling == (len(shown) > 3)
     assert found.agrees is (False if found.telling else None)
+    if not found.telling:  # Among all conventions, one would agree by chance.
+        with pytest.raises(
+            AlignmentError, match=r"masks of so few labels .* expected photos .* or masks of more objects"
+        ):
+            find_alignment(scene, views)
+
+
+def test_masks_of_few_labels_that_agree_are_left_where_they_are(demo_run: Path) -> None:
+    views = Dataset(demo_run / "scene").views("train")
+    scene = GaussianScene.load(demo_run / "scene/scene.ply")
+    agrees = Agreement("masks", 6, 0.4, 0.2, True, telling=False)
+    with patch.object(placing, "agreement", return_value=agrees):
+        assert not find_alignment(scene, views).alignment.parts
 
 
 def test_a_report_does_not_blame_cameras_for_masks_of_few_labels() -> None:
