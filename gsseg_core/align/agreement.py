@@ -99,6 +99,11 @@ class Agreement:
     telling: bool = True  # whether views show enough to say that cameras and scene do not belong together
 
     @property
+    def margin(self) -> float:
+        """By how much views score better than pictures that do not belong together."""
+        return self.score - self.chance
+
+    @property
     def doubt(self) -> str:
         """Say in a sentence without its stop that cameras and scene may not belong together; "" where they do."""
         if self.agrees:

@@ -138,9 +138,7 @@ def find_alignment(
     told = far_off(scene.rounding) if scene.rounding >= _LOST else "" if before.agrees else before.nearness
     if told:  # To search takes minutes, and finds nothing.
         raise AlignmentError(f"alignment: {told}")
-    if not before.telling:  # Among all conventions, one agrees by chance.
-        if before.agrees:
-            return Found(Alignment(), before, before)
+    if not before.telling and not before.agrees:
         raise AlignmentError(
             f"alignment: {before.doubt} ({before}); expected photos of the views in images/, or masks of more objects"
         )
@@ -153,15 +151,21 @@ def find_alignment(
             return as_they_are
         agreeing.append(as_they_are)
     alignment = Alignment(find_convention(scene, shown, settings, device, progress))
-    if (reached := search.through(alignment)).agrees:
+    reached = search.through(alignment)
+    # Of a thousand conventions, the best agrees with masks a little better than the right one by chance.
+    better = search.has_photos or reached.margin >= before.margin + settings.mask_margins[0]
+    if before.agrees and not better:
+        return Found(Alignment(), before, before)
+    if reached.agrees and better:
         by_convention = search.closer(alignment, reached)
         if by_convention.offset_px is None or by_convention.offset_px <= settings.reprojection_px:
             return by_convention
         agreeing.append(by_convention)
     if not search.has_photos:
         raise AlignmentError(
-            f"alignment: no convention of axes has scene and masks agree ({reached} at best); expected photos of the "
-            "views in images/, by which scale, rotation and translation can be found, too"
+            f"alignment: no convention of axes has scene and masks agree ({reached} at best; cameras as they are: "
+            f"{before}); expected photos of the views in images/, by which scale, rotation and translation can be "
+            "found, too"
         )
     try:
         agreeing.append(search.registered(progress))

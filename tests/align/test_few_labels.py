@@ -11,6 +11,7 @@ import pytest
 
 from gsseg_core.align import placing
 from gsseg_core.align.agreement import Agreement, agreement, look_at
+from gsseg_core.align.conventions import Convention
 from gsseg_core.align.placing import find_alignment
 from gsseg_core.align.settings import AlignSettings
 from gsseg_core.data.dataset import Dataset
@@ -34,18 +35,28 @@ def test_masks_of_few_labels_never_say_that_cameras_do_not_fit(demo_run: Path, s
     assert found is not None and found.telling == (len(shown) > 3)
     assert found.agrees is (False if found.telling else None)
     if not found.telling:  # Among all conventions, one would agree by chance.
-        with pytest.raises(
-            AlignmentError, match=r"masks of so few labels .* expected photos .* or masks of more objects"
-        ):
+        with pytest.raises(AlignmentError, match=r"masks of so few labels .* expected photos of the views"):
             find_alignment(scene, views)
 
 
-def test_masks_of_few_labels_that_agree_are_left_where_they_are(demo_run: Path) -> None:
+@pytest.mark.parametrize(
+    ("before", "reached", "moved"), [(0.12, 0.14, False), (0.12, 0.16, True), (0.09, 0.11, None), (0.05, 0.11, True)]
+)
+def test_a_convention_that_masks_hardly_prefer_is_not_taken(
+    demo_run: Path, before: float, reached: float, moved: bool | None
+) -> None:
     views = Dataset(demo_run / "scene").views("train")
     scene = GaussianScene.load(demo_run / "scene/scene.ply")
-    agrees = Agreement("masks", 6, 0.4, 0.2, True, telling=False)
-    with patch.object(placing, "agreement", return_value=agrees):
-        assert not find_alignment(scene, views).alignment.parts
+    found = [Agreement("masks", 6, 0.1 + margin, 0.1, True if margin > 0.1 else None) for margin in (before, reached)]
+    with (
+        patch.object(placing, "agreement", side_effect=found),
+        patch.object(placing, "find_convention", lambda *_: Convention(inverted=True)),
+    ):
+        if moved is None:
+            with pytest.raises(AlignmentError, match="no convention of axes has scene and masks agree"):
+                find_alignment(scene, views)
+        else:
+            assert bool(find_alignment(scene, views).alignment.parts) == moved
 
 
 def test_a_report_does_not_blame_cameras_for_masks_of_few_labels() -> None:
