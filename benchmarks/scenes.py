@@ -1,4 +1,4 @@
-"""The scenes that results are measured on: the demo's, and those of the shared data."""
+"""The scenes that results are measured on: the demo's, a garden, and those of the shared data."""
 
 from __future__ import annotations
 
@@ -6,17 +6,22 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
+from workloads import RoomSize, write_room
+
 from gsseg_core.data.dataset import Dataset
 from gsseg_core.data.view import View
 from gsseg_core.demo.table_scene import build_demo
 from gsseg_core.scene.gaussian_scene import GaussianScene
 
-DEMO, APARTMENT = "demo", "replica_apartment"
+DEMO, GARDEN, APARTMENT = "demo", "garden", "replica_apartment"
 MADE_UP = ("shelf", "kitchen_table", "workbench")
 REAL = (APARTMENT, *MADE_UP)
 """Of the shared data; those that are absent are not measured."""
 
 NO_BACKGROUND = (APARTMENT, "workbench")
+
+OUTDOORS = RoomSize(120_000, 40, 16, 480, 360, tests=8, outdoors=True)
+"""The garden: outlines of its objects are soft, and so its edges lie beside them in all views alike."""
 
 
 class Opened(NamedTuple):
@@ -29,10 +34,10 @@ class Opened(NamedTuple):
 
 
 def open_scene(name: str, folder: Path, data: Path) -> Opened:
-    """Open a scene of the shared data, or build the demo's in a folder."""
+    """Open a scene of the shared data, or build the demo's or the garden in a folder."""
     if name == DEMO:
         return Opened(name, build_demo(folder).scene, Dataset(folder, "labels_true"), Dataset(folder))
-    place = data / name
+    place = write_room(folder, OUTDOORS, wrong=True, seed=13) if name == GARDEN else data / name
     return Opened(name, GaussianScene.load(place / "scene.ply"), Dataset(place), Dataset(place, "labels_noisy"))
 
 

@@ -105,6 +105,21 @@ def test_a_little_evidence_moves_nothing() -> None:
     np.testing.assert_array_equal(align_boundaries(wrong, faint, FARTHEST), wrong)
 
 
+def test_a_little_that_each_of_many_boundaries_gains_moves_none() -> None:
+    y, x = np.indices((96, 128))
+    inside = 11.5 - np.hypot((y % 32) - 16, (x % 32) - 16)  # px from the outlines of twelve discs
+    labels = np.where(inside > 0, 1 + 4 * (y // 32) + x // 32, 0).astype(np.int32)
+
+    def moved(stronger: float) -> bool:
+        """Whether outlines go to edges that are a little farther inside, and so much stronger there."""
+        edges = (np.abs(inside) < 2) * 1.0 + ((inside > 1) & (inside < 2)) * stronger
+        return bool((align_boundaries(labels, edges.astype(np.float32), FARTHEST) != labels).any())
+
+    assert moved(1.0) and not moved(0.5)
+    with patch.object(boundary_alignment, "EACH_CLEAR", 0.0):
+        assert moved(0.5)
+
+
 def test_without_edges_nothing_moves() -> None:
     labels = discs()
     np.testing.assert_array_equal(align_boundaries(labels, np.zeros(labels.shape, np.float32), FARTHEST), labels)

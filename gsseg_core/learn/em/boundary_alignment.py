@@ -15,7 +15,8 @@ found to be 0, so p favours 0, and the rest stays, too, unless the edges are cle
 Three hypotheses on a mask are compared by the evidence for each, its log-likelihood: that it is right, exact; that
 regions were drawn too wide or too narrow, by the bound that the mean field maximises, sum_q log-posterior + entropy of
 q; and that the mask as a whole lies beside its image (`gsseg_core.learn.em.mask_offset`), with regions right or not.
-The first stands unless another is clearly likelier. So true masks stay as they are, and a mask whose pose is off is
+The first stands unless another is clearly likelier, shifts of many regions the more clearly, since a little that each
+of them gains, by soft edges beside it, is much in sum. So true masks stay as they are, and a mask whose pose is off is
 moved as a whole, and not bent to edges that are not its own. Where edges are no stronger along the boundaries than
 elsewhere, as on a wall of posters, nothing is moved. docs/method.md has the reasons.
 """
@@ -50,6 +51,13 @@ TELLING = 1.75
 """Nothing is moved unless edges within S px of the boundaries are this many times as strong as in the whole view."""
 
 CLEAR = 4.0  # nats by which another hypothesis must be likelier than that nothing has to be moved
+
+EACH_CLEAR, ALL_CLEAR = 1.0, 20.0
+"""Nats by which shifts of regions must be likelier than that: so many more for each boundary moved, so many at most.
+
+Errors of masks differ from view to view, and even out over many. Edges that are soft, as of leaves, lie beside the
+objects in all views alike: what is moved to them is a little nearer to the truth in each view, and worse over all.
+"""
 
 BAND = 64  # rows of the image that are gone through at once
 ROUNDS = 6  # of the mean field, each with a better prior
@@ -101,9 +109,9 @@ def _align_regions(labels: np.ndarray, edges: np.ndarray, farthest: int) -> _Ali
     aligned, evidence = labels.copy(), still
     if tells:
         shifts, of_shifts = _shifts(pairs[moving], log_likelihood, len(area), farthest)
-        if of_shifts > still + CLEAR:
+        moved = np.where(moving, np.clip(shifts[pairs[:, 0]] - shifts[pairs[:, 1]], -most, most), 0)
+        if of_shifts > still + min(CLEAR + EACH_CLEAR * np.count_nonzero(moved), ALL_CLEAR):
             evidence = of_shifts
-            moved = np.where(moving, np.clip(shifts[pairs[:, 0]] - shifts[pairs[:, 1]], -most, most), 0)
             _move(region, other, ring, pair, pairs, moved, labels.ravel()[first], aligned)
     return _Alignment(aligned, evidence, tells, beside, (weights / along)[pair[beside]])
 
