@@ -125,8 +125,9 @@ def find_alignment(
     """Find where cameras are in a scene, from what their photos show or, without photos, their masks.
 
     With photos, the cameras are tried as they are, then by conventions, and at last by a similarity; with masks, by
-    conventions alone. Taken is the first alignment by which photos and renderings lie upon each other, or else the one
-    that agrees best. Raises `AlignmentError` where none agrees.
+    conventions alone, which must agree clearly better than the cameras as they are. Taken is the first alignment by
+    which photos and renderings lie upon each other, or else the one that agrees best. Raises `AlignmentError` where
+    none agrees, or masks show too little to tell.
     """
     settings = settings or AlignSettings()
     shown = look_at(views, settings)
