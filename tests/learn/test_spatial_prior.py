@@ -105,7 +105,9 @@ def test_the_better_a_neighbour_was_seen_the_more_it_counts_and_one_that_was_not
     for i in rng.choice(n, 20, replace=False):
         distances = np.linalg.norm(means - means[i], axis=1)
         distances[i] = np.inf
-        near = np.argsort(distances)[:k]
+        near, beyond = np.split(np.argsort(distances)[: k + 1], [k])
+        if distances[beyond] - distances[near].max() < 1e-6 * distances[beyond]:
+            continue  # Both are as near to float32, so that either may count.
         weights = np.maximum(evidence[near] / (evidence[near] + HALF), 2.0**-10) * (evidence[near] > 0)
         expected = 3.0 * weights @ codes[near] / max(weights.sum(), 1e-9)
         np.testing.assert_allclose(found[i], expected, atol=1e-3)
