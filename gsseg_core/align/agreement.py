@@ -178,10 +178,10 @@ def agreement(
     chance = min(turned, float(scores[~own].mean())) if len(shown) > 1 else turned
     photos = shown[0].labels is None
     disagrees, agrees = settings.photo_margins if photos else settings.mask_margins
-    telling = any(view.telling for view in shown)
-    verdict = True if score - chance >= agrees else False if telling and score - chance < disagrees else None
-    too_near = _too_near(few, [view.camera for view in shown])
-    return Agreement("photos" if photos else "masks", len(shown), score, chance, verdict, too_near, telling)
+    too_near, telling = _too_near(few, [view.camera for view in shown]), any(view.telling for view in shown)
+    found = Agreement("photos" if photos else "masks", len(shown), score, chance, None, too_near, telling)
+    verdict = True if found.margin >= agrees else False if telling and found.margin < disagrees else None
+    return replace(found, agrees=verdict)
 
 
 def _too_near(scene: GaussianScene, cameras: Sequence[Camera]) -> float:

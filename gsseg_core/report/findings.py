@@ -95,10 +95,11 @@ def frame_of(report: Mapping[str, Any], asked: str = "DATASET --scene SCENE") ->
     if agreement:
         found = Agreement(**agreement)
         doctor = f"gsseg doctor {asked}"
-        frames = f"the two may be in different frames; try --align, or {doctor}"
-        if not found.telling:
-            frames = f"look at the pictures; with photos of the views in images/, {doctor} tells"
-        told.append(found.nearness or (found.doubt and f"{found.doubt}: {frames}"))
+        if found.telling:
+            advice = f"the two may be in different frames; try --align, or {doctor}"
+        else:
+            advice = f"look at the pictures; with photos of the views in images/, {doctor} tells"
+        told.append(found.nearness or (found.doubt and f"{found.doubt}: {advice}"))
         if (masks := report["frame"].get("masks")) and masks["agrees"] is False:
             told.append(f"{Agreement(**masks).doubt}, but as photos do: are masks of other views, or turned?")
     return [sentence for sentence in told if sentence]
