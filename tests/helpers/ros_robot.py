@@ -132,6 +132,7 @@ class Robot:
         self.process.wait_for("active: listening", timeout=PATIENCE)  # Compiles its kernels after an installation.
         self.ros.wait_until(lambda: all(map(self._heard, ("mask", "camera_info"))), "the node's subscriptions")
         self.ros.wait_until(lambda: any(map(self._heard, ("pose", "odometry"))), "the node's subscription to poses")
+        self.wait_for_state("active")
 
     def _heard(self, topic: str) -> bool:
         return self.publishers[topic].get_subscription_count() > 0
@@ -145,6 +146,10 @@ class Robot:
     def state(self) -> str:
         """Lifecycle state."""
         return str(self.ask("get_state").current_state.label)
+
+    def wait_for_state(self, state: str) -> None:
+        """Wait for the end of a transition that the node takes by itself: it says how that ends before it has ended."""
+        self.ros.wait_until(lambda: self.state == state, f"the state {state}")
 
     def brought_to(self, state: str) -> Robot:
         """Take the steps from unconfigured to another state."""

@@ -11,7 +11,6 @@ from typing import Any
 
 import pytest
 from diagnostic_msgs.msg import DiagnosticStatus
-from lifecycle_msgs.msg import State
 from rclpy.lifecycle import LifecycleNode, TransitionCallbackReturn
 from rclpy.qos import DurabilityPolicy, ReliabilityPolicy
 from ros_fixtures import node_fixture, parameters_fixture, root_fixture  # noqa: F401
@@ -96,7 +95,7 @@ def test_without_tf2_ros_the_pose_source_tf_is_one_clear_error(ros: Ros, paramet
     assert len(errors) == 1 and "Traceback" not in process.output
     assert "parameter pose_source is 'tf', but TF cannot be used here" in errors[0]
     assert "expected the apt package ros-jazzy-tf2-ros-py to be installed, or pose_source 'topic'" in errors[0]
-    assert robot.ask("get_state").current_state.id == State.PRIMARY_STATE_INACTIVE
+    robot.wait_for_state("inactive")
 
 
 def test_diagnostics_are_due_once_a_second(node: SegmentNode) -> None:

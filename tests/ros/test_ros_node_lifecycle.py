@@ -139,7 +139,7 @@ def test_a_configure_that_fails_leaves_it_unconfigured_until_the_parameter_is_ri
     process.wait_for("cannot be configured")
     (line,) = (line for line in process.output.splitlines() if "[ERROR]" in line)
     assert f"parameter scene_path: {root}/no.ply does not exist; expected a scene" in line
-    assert robot.state == "unconfigured"
+    robot.wait_for_state("unconfigured")
     assert not robot.change("configure")
     (root / "broken.ply").write_text("no PLY")
     assert robot.set("scene_path", str(root / "broken.ply")) == (True, "")
@@ -163,7 +163,7 @@ def test_an_activate_that_fails_leaves_it_inactive_until_the_parameter_is_right(
         pytest.skip("tf2_ros is installed, so that nothing makes it fail")
     robot = Robot(ros)
     robot.start({**parameters, "pose_source": "tf"}).wait_for("cannot be activated: parameter pose_source is 'tf'")
-    assert robot.state == "inactive"
+    robot.wait_for_state("inactive")
     assert_not_active(robot)
     assert not robot.change("activate")
     assert robot.state == "inactive"

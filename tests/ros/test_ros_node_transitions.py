@@ -163,7 +163,7 @@ def test_a_misspelt_quality_of_service_is_one_clear_error(
     topic, _, policy = override.split(".")
     process = robot.start({**parameters, f"qos_overrides.{override}": "relible"}, lossless=False)
     process.wait_for(f"cannot be {step}")
-    assert robot.state == state
+    robot.wait_for_state(state)
     (line,) = (line for line in process.output.splitlines() if "[ERROR]" in line)
     assert f"cannot be {step}: parameters qos_overrides of the topic " in line and topic.split("/")[-1] in line
     assert f"`{policy}`: `relible`; expected reliability reliable or best_effort" in line
