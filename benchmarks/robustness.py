@@ -105,11 +105,12 @@ def main() -> int:
     warm_up()
     with tempfile.TemporaryDirectory() as folder:
         benches = list(open_benches(Path(folder), options.data, options.quick))
-        sections = [measure_bar(benches), measure_curves(benches, out.parent / "pictures", aside)]
+        bar, cost = measure_bar(benches)
+        sections = [bar, measure_curves(benches, out.parent / "pictures", aside)]
         sections.append(measure_reliability(benches, out.parent / "pictures", aside))
         sections.append(measure_occluder(benches))
     minutes = (time.perf_counter() - start) / 60
-    header = HEADER.format(machine=machine(), minutes=f"{minutes:.0f}", quick=" --quick" * options.quick)
+    header = HEADER.format(cost=cost, machine=machine(), minutes=f"{minutes:.0f}", quick=" --quick" * options.quick)
     write_page(out, "\n".join([header, *sections]))
     return 0
 
@@ -166,15 +167,15 @@ def tell(bench: Bench, what: str, mious: Mapping[str, float]) -> None:
 # The bar
 
 
-def measure_bar(benches: Sequence[Bench]) -> str:
-    """Measure what realistic errors cost each learner, and then what each error costs alone."""
-    rows, alone = [], []
+def measure_bar(benches: Sequence[Bench]) -> tuple[str, str]:
+    """Measure what realistic errors cost each learner, then each error alone: a section, and what `em` loses."""
+    rows, alone, most = [], [], []
     for bench in benches:
         clean = learn(bench, bench.train, (*LEARNERS, STILL))
         tell(bench, "true masks", clean)
         drawn = {f"drawn, seed {seed}": corrupt_views(bench.train, seed, bench.realistic) for seed in (0, 1)}
         sets = {"as they came": bench.given, **drawn} if bench.given else drawn
-        first = next(iter(sets))
+        first, worst = next(iter(sets)), 1.0
         for title, views in sets.items():
             some = LEARNERS if title == first else (EM, PLAIN, VOTES, HARD)
             wrong = learn(bench, views, (*some, STILL))
@@ -182,10 +183,12 @@ def measure_bar(benches: Sequence[Bench]) -> str:
             for name, miou in wrong.items():
                 figures = points(clean[name]), points(miou), lost(clean[name], miou)
                 rows.append([f"{bench.name}, {title}", name, *figures])
+            worst = min(worst, wrong[EM])
+        most.append(f"up to {lost(clean[EM], worst)}{' points of mIoU' * (not most)} in the {bench.name}")
         alone += [[bench.name, *row] for row in measure_parts(bench, clean)]
     header = ["masks", "learner", "true masks: mIoU", "wrong masks: mIoU", "points lost"]
     parts = ["scene", "error", "right pixels", EM, "points lost", STILL, PLAIN, VOTES]
-    return BAR.format(table=markdown(header, rows), parts=markdown(parts, alone))
+    return BAR.format(table=markdown(header, rows), parts=markdown(parts, alone)), ", ".join(most)
 
 
 def lost(clean: float, wrong: float) -> str:

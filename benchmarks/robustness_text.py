@@ -5,7 +5,7 @@ from __future__ import annotations
 HEADER = """# Robustness
 
 How wrong masks and poses may be, and which masks to trust. With the default learner, `em`, a quarter of the objects
-wrong in every view costs less than half a point of mIoU in the demo scene and up to 4.6 points in the real one.
+wrong in every view costs {cost}.
 `report.json` names the views that are [least reliable](#which-masks-to-trust). The node's [depth
 gating](#somebody-walks-through-the-room) takes out people who walk through a room.
 

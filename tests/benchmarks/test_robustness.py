@@ -65,7 +65,13 @@ def test_curves_and_the_bar_become_text_and_pictures(tmp_path: Path, monkeypatch
     curves = robustness.measure_curves([small], tmp_path, tmp_path / "aside")
     assert "| holes | 1 |" in curves and "| jittered poses | 1 | 1.000 |" in curves and "{" not in curves
     assert (tmp_path / "robustness_demo.svg").exists() and (tmp_path / "aside/robustness_demo.json").exists()
-    bar = robustness.measure_bar([small])
+    bar, cost = robustness.measure_bar([small])
+    em = [
+        line.split("|")[-2].strip()
+        for line in bar.splitlines()
+        if line.startswith("| demo scene, drawn") and "| em |" in line
+    ]
+    assert cost == f"up to {max(em, key=float)} points of mIoU in the demo scene" and len(em) == 2
     assert "| demo scene, drawn, seed 1 | FlashSplat's rule |" in bar and "15 % missed" in bar and "{" not in bar
     reliability = robustness.measure_reliability([small], tmp_path, tmp_path)
     assert "of 1 |" in reliability and (tmp_path / "reliability.svg").exists()
