@@ -186,11 +186,13 @@ def agreement(
 
 def _too_near(scene: GaussianScene, cameras: Sequence[Camera]) -> float:
     """Share of the centres in the images of some cameras that are nearer than what is drawn."""
-    depths = [np.zeros(0)]
+    near = inside = 0
     for camera in cameras:
-        pixels, depth = camera.project(scene.means)
-        depths.append(depth[((pixels >= 0) & (pixels < (camera.width, camera.height))).all(axis=1)])
-    return float((np.concatenate(depths) < NEAR).mean()) if any(map(len, depths)) else 0.0
+        projection = camera.K @ camera.world_to_camera[:3]
+        x, y, z = projection[:, :3] @ scene.means.T + projection[:, 3:]  # Pixels times depth; no division is needed.
+        seen = (z > 0) & (x >= 0) & (x < camera.width * z) & (y >= 0) & (y < camera.height * z)
+        near, inside = near + int((seen & (z < NEAR)).sum()), inside + int(seen.sum())
+    return near / inside if inside else 0.0
 
 
 def thinned(scene: GaussianScene, most: int) -> GaussianScene:
