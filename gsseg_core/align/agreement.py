@@ -14,7 +14,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import NamedTuple
 
 import numpy as np
@@ -33,7 +33,7 @@ from gsseg_core.scene.gaussian_scene import GaussianScene
 from gsseg_core.several_at_once import several_at_once
 
 LUMINANCE = np.array([0.299, 0.587, 0.114], np.float32)  # of RGB, ITU-R BT.601
-_EDGE_PX = 3  # px of a picture along the border of its image whose edges are not compared
+EDGE_PX = 3  # px of a picture along the border of its image whose edges are not compared
 _REACH = 4  # px to either side that are weighed by the filter, a Gaussian of 1 px standard deviation
 _BLUR = np.exp(-0.5 * np.arange(-_REACH, _REACH + 1, dtype=np.float32) ** 2)  # its weights
 _BLUR /= _BLUR.sum()
@@ -97,6 +97,7 @@ class Agreement:
     agrees: bool | None  # whether cameras and scene belong together; None where that is undecided
     too_near: float = 0.0  # share of the Gaussians in the views' pictures that are too near to be drawn
     telling: bool = True  # whether views show enough to say that cameras and scene do not belong together
+    misplaced: str = ""  # how masks lie beside what they show, where that was looked at; "" where they do not
 
     @property
     def margin(self) -> float:
@@ -139,6 +140,27 @@ def far_off(rounding: float) -> str:
     )
 
 
+@dataclass(frozen=True, eq=False)
+class Pictures:
+    """A scene of few Gaussians, as cameras see it; each camera's picture is rendered once."""
+
+    few: GaussianScene  # thinned out
+    device: str
+    _kept: dict[bytes, Rendered] = field(default_factory=dict, init=False)
+
+    @classmethod
+    def of(cls, scene: GaussianScene, settings: AlignSettings, device: str = "cpu") -> Pictures:
+        """Thin a scene out."""
+        return cls(thinned(scene, settings.gaussians), device)
+
+    def seen_by(self, camera: Camera) -> Rendered:
+        """Give the picture of a camera."""
+        place = camera.K.tobytes() + camera.world_to_camera.tobytes()
+        if place not in self._kept:
+            self._kept[place] = render(self.few, camera, self.device)
+        return self._kept[place]
+
+
 def look_at(views: Sequence[View], settings: AlignSettings) -> list[Shown]:
     """Read what some views show: their photos, if there are any, else their masks; those that are broken are left out.
 
@@ -158,27 +180,24 @@ def look_at(views: Sequence[View], settings: AlignSettings) -> list[Shown]:
     return []
 
 
-def agreement(
-    scene: GaussianScene, shown: Sequence[Shown], settings: AlignSettings, device: str = "cpu"
-) -> Agreement | None:
+def agreement(pictures: Pictures, shown: Sequence[Shown], settings: AlignSettings) -> Agreement | None:
     """Compare a scene with views, at least one, each from its own camera; None if there is none."""
     if not shown:
         return None
-    few = thinned(scene, settings.gaussians)
 
     def compared(view: Shown) -> tuple[float, list[float]]:
         """Render a view, and score its own picture upside down, and the pictures of all views."""
-        picture = render(few, view.camera, device)
+        picture = pictures.seen_by(view.camera)
         return view.upside_down().score(picture), [each.score(picture) for each in shown]
 
-    upside_down, rows = zip(*several_at_once(compared, shown, device), strict=True)
+    upside_down, rows = zip(*several_at_once(compared, shown, pictures.device), strict=True)
     scores, turned = np.array(rows), float(np.mean(upside_down))
     score, own = float(np.diag(scores).mean()), np.eye(len(shown), dtype=bool)
     # Of a robot that stands still all views are the same, and of an endless floor both ways up.
     chance = min(turned, float(scores[~own].mean())) if len(shown) > 1 else turned
     photos = shown[0].labels is None
     disagrees, agrees = settings.photo_margins if photos else settings.mask_margins
-    too_near, telling = _too_near(few, [view.camera for view in shown]), any(view.telling for view in shown)
+    too_near, telling = _too_near(pictures.few, [view.camera for view in shown]), any(view.telling for view in shown)
     found = Agreement("photos" if photos else "masks", len(shown), score, chance, None, too_near, telling)
     verdict = True if found.margin >= agrees else False if telling and found.margin < disagrees else None
     return replace(found, agrees=verdict)
@@ -261,14 +280,14 @@ class _Window(NamedTuple):
         corners = principal - reach * focal, principal + reach * focal
         K = np.array([[side / 2 / reach, 0, side / 2], [0, side / 2 / reach, side / 2], [0, 0, 1]])
         centres = (np.arange(side)[:, None] + 0.5) / side * (corners[1] - corners[0]) + corners[0]  # (S, 2)
-        margin = _EDGE_PX * 2 * reach * focal / side
+        margin = EDGE_PX * 2 * reach * focal / side
         columns, rows = ((centres > margin) & (centres < size - margin)).T
         seen = rows[:, None] & columns[None]
         window = cls(replace(camera, width=side, height=side, K=K), (*corners[0], *corners[1]), seen)
         if camera.undistortion is None:
             return window
         reached = window.cut(Image.fromarray(camera.undistortion.reached), Image.Resampling.NEAREST)
-        around = sliding_window_view(np.pad(reached, _EDGE_PX), (2 * _EDGE_PX + 1, 2 * _EDGE_PX + 1))
+        around = sliding_window_view(np.pad(reached, EDGE_PX), (2 * EDGE_PX + 1, 2 * EDGE_PX + 1))
         return window._replace(seen=seen & around.all(axis=(2, 3)))
 
     def cut(self, image: Image.Image, resampling: Image.Resampling) -> np.ndarray:

@@ -20,11 +20,10 @@ from typing import Any
 
 import numpy as np
 
-from gsseg_core.align.agreement import Shown, render, thinned
+from gsseg_core.align.agreement import Pictures, Shown, render
 from gsseg_core.align.settings import AlignSettings
 from gsseg_core.progress import Progress, silent, with_progress
 from gsseg_core.scene.camera import Camera, rigid_motion
-from gsseg_core.scene.gaussian_scene import GaussianScene
 from gsseg_core.scene.scene_delta import similarity_entry
 from gsseg_core.scene.similarity import Similarity
 
@@ -122,21 +121,16 @@ class Alignment:
 
 
 def find_convention(
-    scene: GaussianScene,
-    shown: Sequence[Shown],
-    settings: AlignSettings,
-    device: str = "cpu",
-    progress: Progress = silent,
+    pictures: Pictures, shown: Sequence[Shown], settings: AlignSettings, progress: Progress = silent
 ) -> Convention:
     """Find the convention that agrees best with some views, at least one."""
-    scene = thinned(scene, settings.gaussians)
     every = product(_LOOKING, (False, True), AXIS_ROTATIONS)
     tried = [Convention(inverted, world, looking) for looking, inverted, world in every]
     scores = np.zeros((len(tried), 4))  # by quarter turns of the camera
     left = list(range(len(tried)))
     for number, view in enumerate(shown):
         for i in with_progress(progress, f"try conventions on view {number + 1} of {len(shown)}", left):
-            rendered = render(scene, tried[i].camera(view.camera), device)
+            rendered = render(pictures.few, tried[i].camera(view.camera), pictures.device)
             turned = np.array([view.score(rendered.turned(quarters)) for quarters in range(4)])
             scores[i] += turned - np.roll(turned, 2)  # less the score upside down
         kept = max(_LEAST, round(settings.survivors * len(left)))

@@ -9,9 +9,10 @@ from functools import cached_property
 from pathlib import Path
 from typing import Any
 
-from gsseg_core.align.agreement import Agreement, Shown, agreement, far_off, look_at
+from gsseg_core.align.agreement import Agreement, Pictures, Shown, agreement, far_off, look_at
 from gsseg_core.align.conventions import Alignment, find_convention
 from gsseg_core.align.features import PhotosInScene
+from gsseg_core.align.mask_fit import THOROUGH, misplaced
 from gsseg_core.align.settings import AlignSettings
 from gsseg_core.data.camera_files import frame_of_training
 from gsseg_core.data.camera_formats.dataparser import DATAPARSER
@@ -54,8 +55,9 @@ class Placed:
 
     @property
     def fits(self) -> bool:
-        """Whether nothing had to be found: the cameras were where they should be."""
-        return bool(self.agreement and self.agreement.agrees and not (self.found and self.found.alignment.parts))
+        """Whether nothing had to be found: cameras and masks were where they should be."""
+        placed = self.agreement and self.agreement.agrees and not (self.found and self.found.alignment.parts)
+        return bool(placed and not (self.masks and self.masks.misplaced))
 
     def describe(self) -> str:
         """Say what was found, for people."""
@@ -70,6 +72,8 @@ class Placed:
             lines += [f"too small: {nearness}"]
         if self.found.offset_px is not None:
             lines += [f"photos and renderings are {self.found.offset_px:.2f} px apart (median of their features)"]
+        if self.masks and self.masks.misplaced:
+            lines += [self.masks.misplaced]
         return "\n".join(lines)
 
     def as_dict(self) -> dict[str, Any]:
@@ -98,21 +102,35 @@ def place(
     scene or in the dataset is found. Raises `AlignmentError` where no place is found for the cameras, and
     `CameraFileError` or `PoseError` where that file is broken, or says nothing of cameras of this format.
     """
-    settings, file = AlignSettings(), None
-    if found := _frame_of_training(scene, dataset, dataparser):
-        file, similarity = found
+    settings, file, found = AlignSettings(), None, None
+    if framed := _frame_of_training(scene, dataset, dataparser):
+        file, similarity = framed
         dataset = dataset.moved(similarity.camera)
     views = dataset.views("train") or dataset.views()
-    if align:
-        aligned = find_alignment(scene, views, settings, device, progress)
-        return Placed(dataset.moved(aligned.alignment.camera), file, aligned, aligned.agreement)
-    if not check:
+    if not align and not check:
         return Placed(dataset, file)
-    seen, masks = agreement(scene, look_at(views, settings), settings, device), None
-    if seen and seen.agrees and seen.compared == "photos":
-        drawn = look_at([replace(view, image_path=None) for view in views], settings)
-        masks = agreement(scene, [mask for mask in drawn if mask.labels is not None and mask.telling], settings, device)
-    return Placed(dataset, file, None, seen, masks)
+    pictures = Pictures.of(scene, settings, device)
+    if align:
+        found = _find_alignment(scene, views, pictures, settings, progress)
+        dataset = dataset.moved(found.alignment.camera)
+        views = dataset.views("train") or dataset.views()
+    seen = found.agreement if found else agreement(pictures, look_at(views, settings), settings)
+    masks = _compare_masks(pictures, views, settings) if seen and seen.agrees and seen.compared == "photos" else None
+    return Placed(dataset, file, found, seen, masks)
+
+
+def _compare_masks(pictures: Pictures, views: Sequence[View], settings: AlignSettings) -> Agreement | None:
+    """Compare the scene with masks whose photos agree with it, and see where these lie; None if they say too little."""
+
+    def drawn(count: int) -> list[Shown]:
+        shown = look_at([replace(view, image_path=None) for view in views], replace(settings, views=count))
+        return [mask for mask in shown if mask.labels is not None and mask.telling]
+
+    few = drawn(settings.views)
+    found = agreement(pictures, few, settings)
+    if found is None or not misplaced(pictures, few, fewest=1):
+        return found
+    return replace(found, misplaced=misplaced(pictures, drawn(THOROUGH)))
 
 
 def find_alignment(
@@ -130,8 +148,14 @@ def find_alignment(
     none agrees, or masks show too little to tell.
     """
     settings = settings or AlignSettings()
+    return _find_alignment(scene, views, Pictures.of(scene, settings, device), settings, progress)
+
+
+def _find_alignment(
+    scene: GaussianScene, views: Sequence[View], pictures: Pictures, settings: AlignSettings, progress: Progress
+) -> Found:
     shown = look_at(views, settings)
-    before = agreement(scene, shown, settings, device)
+    before = agreement(pictures, shown, settings)
     if before is None:
         raise AlignmentError(
             "alignment: no view has a photo, or a mask with outlines; expected some, to see where cameras are by them"
@@ -143,7 +167,7 @@ def find_alignment(
         raise AlignmentError(
             f"alignment: {before.doubt} ({before}); expected photos of the views in images/, or masks of more objects"
         )
-    search, agreeing = _Search(scene, views, shown, before, settings, device), list[Found]()
+    search, agreeing = _Search(scene, views, shown, before, pictures, settings), list[Found]()
     # Masks say less than photos do: the regions of a shelf may agree from a wrong side, too.
     if before.agrees and search.has_photos:
         as_they_are = search.closer(Alignment(), before)
@@ -151,7 +175,7 @@ def find_alignment(
         if as_they_are.offset_px is not None and as_they_are.offset_px <= _CLOSE_PX:
             return as_they_are
         agreeing.append(as_they_are)
-    alignment = Alignment(find_convention(scene, shown, settings, device, progress))
+    alignment = Alignment(find_convention(pictures, shown, settings, progress))
     reached = search.through(alignment)
     # Of a thousand conventions, the best agrees with masks a little better than the right one by chance.
     better = search.has_photos or reached.margin >= before.margin + settings.mask_margins[0]
@@ -184,8 +208,8 @@ class _Search:
     views: Sequence[View]
     shown: list[Shown]  # by some of the views, at least one
     before: Agreement  # of the scene with these, with the cameras where they were
+    pictures: Pictures  # of the scene
     settings: AlignSettings
-    device: str
 
     @property
     def has_photos(self) -> bool:
@@ -195,7 +219,7 @@ class _Search:
     @cached_property
     def photos(self) -> PhotosInScene:
         """Photos that renderings are matched with."""
-        return PhotosInScene.read(self.views, self.scene, self.settings, self.device)
+        return PhotosInScene.read(self.views, self.scene, self.settings, self.pictures.device)
 
     def registered(self, progress: Progress) -> Found:
         """Find a similarity by the photos."""
@@ -232,7 +256,7 @@ class _Search:
     def through(self, alignment: Alignment) -> Agreement:
         """Compare the scene with what views show, after their cameras are moved."""
         moved = [replace(view, camera=alignment.camera(view.camera)) for view in self.shown]
-        compared = agreement(self.scene, moved, self.settings, self.device)
+        compared = agreement(self.pictures, moved, self.settings)
         assert compared is not None
         return compared
 

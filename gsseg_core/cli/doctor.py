@@ -41,7 +41,7 @@ to type. The exit code is 0 if gsseg works, with or without extras, and 2 if not
 
 Of a scene it prints its format instead, and what this format keeps of a Gaussian. Of a dataset it reads cameras and
 masks, and prints what is there. With --scene it prints whether the cameras fit the scene (exit code 0), and if not
-(2), which axes, scale, rotation and translation make them fit.
+(2), which axes, scale, rotation and translation make them fit; and whether masks lie on what photos show.
 """
 EXAMPLES = """
   gsseg doctor
@@ -87,7 +87,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     what = "a scene, to print its format; or a dataset, to read it, and with --scene to see whether its cameras fit"
     parser.add_argument("path", nargs="?", metavar="PATH", help=what)
     parser.add_argument("--scene", metavar="SCENE", help="trained scene that cameras of the dataset PATH should fit")
-    labels = "the masks, as for gsseg segment; with --scene, they count where there are no photos (default: labels)"
+    labels = "the masks, as for gsseg segment; without photos, --scene goes by them alone (default: labels)"
     parser.add_argument("--labels", default=LABELS, metavar="PATH", help=labels)
     add_dataparser(parser)
     add_device(parser)

@@ -100,8 +100,10 @@ def frame_of(report: Mapping[str, Any], asked: str = "DATASET --scene SCENE") ->
         else:
             advice = f"look at the pictures; with photos of the views in images/, {doctor} tells"
         told.append(found.nearness or (found.doubt and f"{found.doubt}: {advice}"))
-        if (masks := report["frame"].get("masks")) and masks["agrees"] is False:
-            told.append(f"{Agreement(**masks).doubt}, but as photos do: are masks of other views, or turned?")
+        if masks := report["frame"].get("masks"):
+            drawn = Agreement(**masks)
+            what = drawn.misplaced or "are masks of other views, or turned?"
+            told.append(f"{drawn.doubt}, but as photos do: {what}" if drawn.agrees is False else drawn.misplaced)
     return [sentence for sentence in told if sentence]
 
 

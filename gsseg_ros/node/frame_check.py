@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from gsseg_core.align.agreement import agreement, look_at
+from gsseg_core.align.agreement import Pictures, agreement, look_at
 from gsseg_core.align.settings import AlignSettings
 from gsseg_core.live.results import Outcome
 from gsseg_core.live.session import LiveSession
@@ -19,7 +19,8 @@ class FrameCheck:
 
     def look(self, session: LiveSession, scene: GaussianScene, outcome: Outcome) -> str:
         """Compare a scene with the views that were learnt from; return what is wrong, empty if nothing is."""
-        found = agreement(scene, look_at(outcome.views, _SETTINGS), _SETTINGS, session.device)
+        pictures = Pictures.of(scene, _SETTINGS, session.device)
+        found = agreement(pictures, look_at(outcome.views, _SETTINGS), _SETTINGS)
         said = ""
         if found is not None and found.nearness:
             said = found.nearness

@@ -17,7 +17,7 @@ from scipy.spatial.transform import Rotation
 
 from gsseg_core.align import agreement as comparison
 from gsseg_core.align import conventions, placing
-from gsseg_core.align.agreement import Agreement, agreement, look_at, render, thinned
+from gsseg_core.align.agreement import Agreement, Pictures, agreement, look_at, render, thinned
 from gsseg_core.align.conventions import AXIS_ROTATIONS, OPENGL, Convention
 from gsseg_core.align.features import Extractor, Features, Photo
 from gsseg_core.align.placing import Found, find_alignment, place
@@ -132,7 +132,7 @@ def test_real_scenes_are_never_said_not_to_fit(real_data: Path) -> None:
         scene, dataset = GaussianScene.load(real_data / name / "scene.ply"), Dataset(real_data / name, "labels_noisy")
         views = dataset.views("train")
         for shown in (views, [replace(view, image_path=None) for view in views if view.has_mask]):
-            found = agreement(scene, look_at(shown, SETTINGS), SETTINGS)
+            found = agreement(Pictures.of(scene, SETTINGS), look_at(shown, SETTINGS), SETTINGS)
             assert found is None or found.agrees, (name, found)
 
 
@@ -165,7 +165,7 @@ def test_an_eighth_of_the_gaussians_tells_whether_cameras_fit(
     assert (few.opacities > 0).all() and (few.opacities < 1).all()
     for folder in (demo, with_photos):
         for dataset, fits in ((Dataset(folder), True), (Dataset(folder).moved(DISTURBED.camera), False)):
-            found = agreement(few, look_at(dataset.views("train"), SETTINGS), SETTINGS)
+            found = agreement(Pictures.of(few, SETTINGS), look_at(dataset.views("train"), SETTINGS), SETTINGS)
             assert found is not None and found.agrees is fits, (folder, found)
 
 

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from gsseg_core.align import placing
-from gsseg_core.align.agreement import Agreement, agreement, look_at
+from gsseg_core.align.agreement import Agreement, Pictures, agreement, look_at
 from gsseg_core.align.conventions import Convention
 from gsseg_core.align.placing import find_alignment
 from gsseg_core.align.settings import AlignSettings
@@ -31,7 +31,7 @@ def test_masks_of_few_labels_never_say_that_cameras_do_not_fit(demo_run: Path, s
         labels = np.where(np.isin(labels, shown), labels, 0).astype(np.int32)
         camera = replace(view.camera, world_to_camera=lost @ view.camera.world_to_camera)
         views.append(View.from_arrays(camera, labels))
-    found = agreement(scene, look_at(views, AlignSettings()), AlignSettings())
+    found = agreement(Pictures.of(scene, AlignSettings()), look_at(views, AlignSettings()), AlignSettings())
     assert found is not None and found.telling == (len(shown) > 3)
     assert found.agrees is (False if found.telling else None)
     if not found.telling:  # Among all conventions, one would agree by chance.
