@@ -156,7 +156,7 @@ Gaussians that refinement took out of an object stay in the scene.
 The labels of most Gaussians are right, but an object cut out is larger than in its masks: Gaussians across its edge, of
 which others hid a part, show in full, and so do those just under a neighbour's surface.
 
-- **KNN** gives unobserved Gaussians to what is around them.
+- **KNN** gives unobserved and unsure Gaussians to what is around them (`--no-knn`: leaves them).
 - **The paper's filter** (`--refine paper`, and what the node publishes) removes whatever is farther from its fellows
   than mu + sigma. Where Gaussians are large and sparse this takes away good ones.
 - **Carving** (the default, `gsseg_core.refine.silhouette_carving`) drops the Gaussians that stick out of the
