@@ -10,18 +10,23 @@ Right masks fit best as they are.
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
+from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
 from PIL import Image
 
-from gsseg_core.align.agreement import EDGE_PX, Pictures, Shown
+from gsseg_core.align.agreement import EDGE_PX, Pictures, Shown, look_at
+from gsseg_core.align.settings import AlignSettings
+from gsseg_core.data.view import View
 
+PIXELS = "expected masks in the pixels of the images"
 THOROUGH = 18  # views by which masks are called misplaced; six are enough to see whether that is worth a look
 _FEWEST = 6  # of these show enough; less tells too little
 _LEAST = 0.65  # of the best correlation, below which masks are misplaced; right ones of six labels have 0.72 at least
 _CHANCE = 0.22  # correlation that masks of something else do not reach; where right ones do not either, nothing is said
 _CLEAR = 1.35  # times the median of all changes is the best correlation at least; by chance it is 1.1 to 1.2
+_SAME = 0.8  # correlation of edges that are seen from one place; from different ones they have 0.6 at most
 _NEAR = 0.04  # share of the picture's side by which edges may lie beside outlines, as those of shadows do
 _REACH = 0.25  # share of the picture's side up to which masks are moved
 _ZOOMS = (0.8, 0.9, 1.1, 1.25)
@@ -46,17 +51,34 @@ class _Change(NamedTuple):
         return np.asarray(image.transform(image.size, Image.Transform.EXTENT, box, Image.Resampling.BILINEAR))
 
 
-def misplaced(pictures: Pictures, shown: Sequence[Shown], fewest: int = _FEWEST) -> str:
+_AS_IT_IS = _Change("")
+
+
+def misplaced(pictures: Pictures, few: Sequence[Shown], views: Sequence[View], settings: AlignSettings) -> str:
     """Say in a sentence without its stop how masks should be changed to lie on what they show; "" where they lie there.
 
-    `shown` are masks, seen by cameras that are where they should be; of fewer than `fewest`, nothing is said.
+    `few` are masks of some of the views; where these lie beside it, more of the views are looked at.
     """
+    if not how_they_lie(pictures, few, fewest=1):
+        return ""
+    return how_they_lie(pictures, masks_of(views, replace(settings, views=THOROUGH)))
+
+
+def masks_of(views: Sequence[View], settings: AlignSettings) -> list[Shown]:
+    """Read the masks of some views, without those of few labels."""
+    shown = look_at([replace(view, image_path=None) for view in views], settings)
+    return [mask for mask in shown if mask.labels is not None and mask.telling]
+
+
+def how_they_lie(pictures: Pictures, shown: Sequence[Shown], fewest: int = _FEWEST) -> str:
+    """Say as `misplaced` how some masks lie; nothing of fewer than `fewest`."""
+    shown, seen = _from_different_places(pictures, [mask for mask in shown if mask.labels is not None and mask.telling])
     if len(shown) < max(fewest, 1):
         return ""
     side = len(shown[0].edges)
     padded, reach = (side + side // 3,) * 2, int(_REACH * side)
     shifts = np.arange(-reach, reach + 1)
-    edges = [np.fft.rfft2(_centred(pictures.seen_by(view.camera).edges[1], view.seen), padded) for view in shown]
+    edges = [np.fft.rfft2(each, padded) for each in seen]
     as_it_is, best, found, moved, every = 0.0, 0.0, _AS_IT_IS, np.zeros(2), list[float]()
     for change in _changes(shown[0].seen):
         laid = [np.fft.rfft2(_centred(change.of(view.edges), view.seen), padded) for view in shown]
@@ -73,8 +95,19 @@ def misplaced(pictures: Pictures, shown: Sequence[Shown], fewest: int = _FEWEST)
         return ""
     return (
         f"masks do not lie on what they show: outlines agree with edges of the scene by {max(as_it_is, 0):.2f}, and by "
-        f"{best:.2f} if masks are {_said(found, moved)}; expected masks in the pixels of the images"
+        f"{best:.2f} if masks are {_said(found, moved)}"
     )
+
+
+def _from_different_places(pictures: Pictures, shown: Sequence[Shown]) -> tuple[list[Shown], list[np.ndarray]]:
+    """Leave out masks from where another is, as of a robot that stands still; gives edges of the scene besides."""
+    kept, edges = list[Shown](), list[np.ndarray]()
+    for view in shown:
+        here = _centred(pictures.seen_by(view.camera).edges[1], view.seen)
+        if all(float((here * other).sum()) < _SAME for other in edges):
+            kept.append(view)
+            edges.append(here)
+    return kept, edges
 
 
 def _changes(seen: np.ndarray) -> Iterator[_Change]:  # (S, S) bool: pixels that lie in the image
@@ -110,6 +143,3 @@ def _said(change: _Change, moved: np.ndarray) -> str:  # (2,) shares of the pict
     if not parts:
         return change.said
     return f"{change.said}{' and ' * bool(change.said)}moved by {' and '.join(parts)} (of the longer side)"
-
-
-_AS_IT_IS = _Change("")

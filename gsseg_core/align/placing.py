@@ -12,7 +12,7 @@ from typing import Any
 from gsseg_core.align.agreement import Agreement, Pictures, Shown, agreement, far_off, look_at
 from gsseg_core.align.conventions import Alignment, find_convention
 from gsseg_core.align.features import PhotosInScene
-from gsseg_core.align.mask_fit import THOROUGH, misplaced
+from gsseg_core.align.mask_fit import PIXELS, masks_of, misplaced
 from gsseg_core.align.settings import AlignSettings
 from gsseg_core.data.camera_files import frame_of_training
 from gsseg_core.data.camera_formats.dataparser import DATAPARSER
@@ -73,7 +73,7 @@ class Placed:
         if self.found.offset_px is not None:
             lines += [f"photos and renderings are {self.found.offset_px:.2f} px apart (median of their features)"]
         if self.masks and self.masks.misplaced:
-            lines += [self.masks.misplaced]
+            lines += [f"{self.masks.misplaced}; {PIXELS}"]
         return "\n".join(lines)
 
     def as_dict(self) -> dict[str, Any]:
@@ -109,28 +109,26 @@ def place(
     views = dataset.views("train") or dataset.views()
     if not align and not check:
         return Placed(dataset, file)
-    pictures = Pictures.of(scene, settings, device)
+    pictures, seen = Pictures.of(scene, settings, device), None
     if align:
         found = _find_alignment(scene, views, pictures, settings, progress)
-        dataset = dataset.moved(found.alignment.camera)
+        dataset, seen = dataset.moved(found.alignment.camera), found.agreement
         views = dataset.views("train") or dataset.views()
-    seen = found.agreement if found else agreement(pictures, look_at(views, settings), settings)
-    masks = _compare_masks(pictures, views, settings) if seen and seen.agrees and seen.compared == "photos" else None
+    else:
+        seen = _compare(pictures, look_at(views, settings), views, settings)
+    photos_fit = seen is not None and bool(seen.agrees) and seen.compared == "photos"
+    masks = _compare(pictures, masks_of(views, settings), views, settings) if photos_fit else None
     return Placed(dataset, file, found, seen, masks)
 
 
-def _compare_masks(pictures: Pictures, views: Sequence[View], settings: AlignSettings) -> Agreement | None:
-    """Compare the scene with masks whose photos agree with it, and see where these lie; None if they say too little."""
-
-    def drawn(count: int) -> list[Shown]:
-        shown = look_at([replace(view, image_path=None) for view in views], replace(settings, views=count))
-        return [mask for mask in shown if mask.labels is not None and mask.telling]
-
-    few = drawn(settings.views)
-    found = agreement(pictures, few, settings)
-    if found is None or not misplaced(pictures, few, fewest=1):
+def _compare(
+    pictures: Pictures, shown: Sequence[Shown], views: Sequence[View], settings: AlignSettings
+) -> Agreement | None:
+    """Compare a scene with what some of the views show, and see how masks lie on it; None if they show nothing."""
+    found = agreement(pictures, shown, settings)
+    if found is None or found.compared == "photos":
         return found
-    return replace(found, misplaced=misplaced(pictures, drawn(THOROUGH)))
+    return replace(found, misplaced=misplaced(pictures, shown, views, settings))
 
 
 def find_alignment(

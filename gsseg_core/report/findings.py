@@ -9,6 +9,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from gsseg_core.align.agreement import Agreement, far_off
+from gsseg_core.align.mask_fit import PIXELS
 from gsseg_core.data.class_names import NOTED, class_name, listed
 from gsseg_core.data.label_images import EXPECTED_IDS
 from gsseg_core.data.view import View
@@ -99,11 +100,16 @@ def frame_of(report: Mapping[str, Any], asked: str = "DATASET --scene SCENE") ->
             advice = f"the two may be in different frames; try --align, or {doctor}"
         else:
             advice = f"look at the pictures; with photos of the views in images/, {doctor} tells"
-        told.append(found.nearness or (found.doubt and f"{found.doubt}: {advice}"))
+        doubted = found.doubt and (found.agrees is False or not found.misplaced)
+        told.append(found.nearness or (f"{found.doubt}: {advice}" if doubted else ""))
+        told.append(found.misplaced and f"{found.misplaced}; {PIXELS}, and cameras that fit the scene")
         if masks := report["frame"].get("masks"):
             drawn = Agreement(**masks)
-            what = drawn.misplaced or "are masks of other views, or turned?"
-            told.append(f"{drawn.doubt}, but as photos do: {what}" if drawn.agrees is False else drawn.misplaced)
+            what = f"{drawn.misplaced}; {PIXELS}" if drawn.misplaced else "are masks of other views, or turned?"
+            if drawn.agrees is False:
+                told.append(f"{drawn.doubt}, but as photos do: {what}")
+            elif drawn.misplaced:
+                told.append(what)
     return [sentence for sentence in told if sentence]
 
 

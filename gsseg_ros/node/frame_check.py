@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from gsseg_core.align.agreement import Pictures, agreement, look_at
+from gsseg_core.align.mask_fit import PIXELS, misplaced
 from gsseg_core.align.settings import AlignSettings
 from gsseg_core.live.results import Outcome
 from gsseg_core.live.session import LiveSession
@@ -19,8 +20,8 @@ class FrameCheck:
 
     def look(self, session: LiveSession, scene: GaussianScene, outcome: Outcome) -> str:
         """Compare a scene with the views that were learnt from; return what is wrong, empty if nothing is."""
-        pictures = Pictures.of(scene, _SETTINGS, session.device)
-        found = agreement(pictures, look_at(outcome.views, _SETTINGS), _SETTINGS)
+        pictures, shown = Pictures.of(scene, _SETTINGS, session.device), look_at(outcome.views, _SETTINGS)
+        found = agreement(pictures, shown, _SETTINGS)
         said = ""
         if found is not None and found.nearness:
             said = found.nearness
@@ -30,6 +31,8 @@ class FrameCheck:
                 "optical frame (x right, y down, z forward) in map_frame, and scene_to_map to say where the scene lies "
                 "there"
             )
+        elif told := misplaced(pictures, shown, outcome.views, _SETTINGS):
+            said = f"{told}; {PIXELS}, and poses of a calibrated camera at the stamps of its masks"
         self._found = session.era, said
         return said
 

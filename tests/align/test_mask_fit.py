@@ -14,7 +14,7 @@ import pytest
 from PIL import Image
 
 from gsseg_core.align.agreement import Agreement, Pictures, look_at
-from gsseg_core.align.mask_fit import THOROUGH, misplaced
+from gsseg_core.align.mask_fit import THOROUGH, how_they_lie
 from gsseg_core.align.placing import place
 from gsseg_core.align.settings import AlignSettings
 from gsseg_core.cli.main import main
@@ -53,13 +53,13 @@ def moved(mask: Image.Image) -> Image.Image:
 
 
 CHANGES: dict[str, tuple[Change, str]] = {
-    "padded": (padded, "if masks are stretched, which undoes that images were padded to squares; expected"),
-    "cut": (cut, "if masks are squeezed, which undoes that squares were cut out of images; expected"),
-    "mirrored": (lambda mask: mask.transpose(Image.Transpose.FLIP_LEFT_RIGHT), "if masks are mirrored; expected"),
-    "upside down": (lambda mask: mask.transpose(Image.Transpose.FLIP_TOP_BOTTOM), "if masks are upside down; expected"),
-    "turned": (lambda mask: mask.transpose(Image.Transpose.ROTATE_180), "if masks are turned by half; expected"),
-    "zoomed": (zoomed, "if masks are shrunk to 80 %; expected"),
-    "moved": (moved, r"if masks are moved by [89] % left and [567] % down \(of the longer side\); expected"),
+    "padded": (padded, "if masks are stretched, which undoes that images were padded to squares$"),
+    "cut": (cut, "if masks are squeezed, which undoes that squares were cut out of images$"),
+    "mirrored": (lambda mask: mask.transpose(Image.Transpose.FLIP_LEFT_RIGHT), "if masks are mirrored$"),
+    "upside down": (lambda mask: mask.transpose(Image.Transpose.FLIP_TOP_BOTTOM), "if masks are upside down$"),
+    "turned": (lambda mask: mask.transpose(Image.Transpose.ROTATE_180), "if masks are turned by half$"),
+    "zoomed": (zoomed, "if masks are shrunk to 80 %$"),
+    "moved": (moved, r"if masks are moved by [89] % left and [567] % down \(of the longer side\)$"),
 }
 
 
@@ -80,7 +80,7 @@ def changed(view: View, change: Change) -> View:
 @pytest.mark.parametrize("name", CHANGES)
 def test_it_is_said_how_masks_would_lie_on_what_they_show(name: str, data: Dataset, pictures: Pictures) -> None:
     change, said = CHANGES[name]
-    told = misplaced(pictures, look_at([changed(view, change) for view in data.views("train")], SETTINGS))
+    told = how_they_lie(pictures, look_at([changed(view, change) for view in data.views("train")], SETTINGS))
     assert told.startswith("masks do not lie on what they show: outlines agree with edges of the scene by 0.")
     assert re.search(said, told)
 
@@ -89,15 +89,17 @@ def test_nothing_is_said_of_masks_that_lie_there_of_masks_of_anything_else_and_o
     data: Dataset, pictures: Pictures
 ) -> None:
     views = data.views("train")
-    assert misplaced(pictures, look_at(views, SETTINGS)) == ""
+    assert how_they_lie(pictures, look_at(views, SETTINGS)) == ""
     rng = np.random.default_rng(0)
     blobs = [np.kron(rng.integers(0, 9, (5, 8)), np.ones((60, 50), int)).astype(np.int32) for _ in views]
     elsewhere = [View.from_arrays(view.camera, blob) for view, blob in zip(views, blobs, strict=True)]
-    assert misplaced(pictures, look_at(elsewhere, SETTINGS)) == ""
+    assert how_they_lie(pictures, look_at(elsewhere, SETTINGS)) == ""
     mirrored = [changed(view, CHANGES["mirrored"][0]) for view in views]
-    assert misplaced(pictures, look_at(mirrored[:5], SETTINGS)) == ""
-    assert misplaced(pictures, look_at(mirrored[:6], SETTINGS)) != ""
-    assert misplaced(pictures, [], 0) == ""
+    assert how_they_lie(pictures, look_at(mirrored[::6], SETTINGS)) == ""
+    assert how_they_lie(pictures, look_at(mirrored[::5], SETTINGS)) != ""
+    assert how_they_lie(pictures, look_at(mirrored[::5] * 3, SETTINGS)) != ""
+    assert how_they_lie(pictures, look_at(mirrored[::6] * 3, SETTINGS)) == "", "more from the same places tell no more"
+    assert how_they_lie(pictures, [], 0) == ""
 
 
 def test_masks_of_real_scenes_as_they_came_lie_on_what_they_show(real_data: Path) -> None:
@@ -108,10 +110,22 @@ def test_masks_of_real_scenes_as_they_came_lie_on_what_they_show(real_data: Path
                 masks = place(scene, Dataset(real_data / name, labels), check=True).masks
                 assert masks is not None and masks.agrees and not masks.misplaced, (name, labels, masks)
         views = Dataset(real_data / name, "labels_noisy").views("train")
-        told = misplaced(
+        told = how_they_lie(
             Pictures.of(scene, SETTINGS), look_at([changed(view, CHANGES["moved"][0]) for view in views], SETTINGS)
         )
         assert "if masks are moved by" in told and " % left " in told, (name, told)
+
+
+def test_without_photos_it_may_be_the_cameras_too(demo_run: Path, data: Dataset, tmp_path: Path) -> None:
+    shutil.copy(data.root / "cameras.json", tmp_path)
+    for view in data.views("train"):
+        write_mask(tmp_path / f"labels/{view.name}.png", changed(view, moved).read_labels(), 8)
+    found = place(GaussianScene.load(demo_run / "scene/scene.ply"), Dataset(tmp_path), check=True)
+    assert found.agreement is not None and found.masks is None and not found.fits
+    assert "if masks are moved by" in found.agreement.misplaced
+    told = frame_of({"scene": {}, "frame": found.as_dict()})
+    assert len(told) == 1 + (found.agreement.agrees is False)
+    assert told[-1].endswith("; expected masks in the pixels of the images, and cameras that fit the scene")
 
 
 def test_commands_say_it_where_photos_agree_with_the_scene(
@@ -129,7 +143,7 @@ def test_commands_say_it_where_photos_agree_with_the_scene(
     assert found.agreement is not None and found.agreement.agrees and found.agreement.compared == "photos"
     assert found.masks is not None and "padded to squares" in found.masks.misplaced and not found.fits
     (told,) = frame_of({"scene": {}, "frame": found.as_dict()})
-    assert told == found.masks.misplaced
+    assert told == f"{found.masks.misplaced}; expected masks in the pixels of the images"
     of_old = {key: value for key, value in vars(found.masks).items() if key != "misplaced"}
     assert replace(found.masks, misplaced="") == Agreement(**of_old), "reports of earlier versions are read"
     segment = ["segment", str(demo_run / "scene/scene.ply"), "--data", str(tmp_path), "--learner", "votes", "--quiet"]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -10,8 +11,10 @@ import numpy as np
 import pytest
 from ros_helpers import Ros, ros_fixture  # noqa: F401
 from ros_robot import CLASSES, Robot
+from scipy.spatial.transform import Rotation
 from small_scenes import NAMES, balls_on_a_table, clean_views, fed, write_dataset
 
+from gsseg_core.data.dataset import Dataset
 from gsseg_core.data.view import View
 from gsseg_core.live.living_session import LivingSession
 from gsseg_core.scene.gaussian_scene import GaussianScene
@@ -31,6 +34,22 @@ def tilted(views: Sequence[View]) -> list[View]:
 def test_views_of_the_scenes_own_frame_are_not_complained_of(count: int) -> None:
     session = fed(LivingSession(balls_on_a_table()[0], NAMES), clean_views(count))
     assert FrameCheck().look(session, session.scene, session.learn()) == ""
+
+
+def test_a_camera_that_is_mounted_a_few_degrees_off_is_told_by_its_masks(demo_run: Path) -> None:
+    data, turn = Dataset(demo_run / "scene"), np.eye(4)
+    turn[:3, :3] = Rotation.from_euler("x", 3, degrees=True).as_matrix()
+    views = data.views("train")[:12]
+    session = LivingSession(GaussianScene.load(demo_run / "scene/scene.ply"), data.class_names)
+    assert FrameCheck().look(fed(session, views), session.scene, session.learn()) == ""
+    session.reset()
+    cameras = [replace(view.camera, world_to_camera=turn @ view.camera.world_to_camera) for view in views]
+    fed(session, [replace(view, camera=camera) for view, camera in zip(views, cameras, strict=True)])
+    said = FrameCheck().look(session, session.scene, session.learn())
+    assert re.search(r"by 0\.\d\d if masks are moved by \d % (up|down) \(of the longer side\); expected masks", said), (
+        said
+    )
+    assert said.endswith("poses of a calibrated camera at the stamps of its masks")
 
 
 def test_what_was_found_holds_until_the_views_are_forgotten_or_others_are_learnt_from() -> None:
