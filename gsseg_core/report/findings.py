@@ -149,6 +149,9 @@ def warnings_of(
     if views["rejected"]:
         reasons = ", ".join(f"{count} {why}" for why, count in views["rejected"].items())
         warnings.append(f"{counted(sum(views['rejected'].values()), 'view')} could not be used: {reasons}.")
+    for told in (*frame_of(report), grey_ids_of(report) or renamed_ids_of(report, written)):
+        if told:
+            warnings.append(f"{told[:1].upper()}{told[1:]}.")
     doubtful = [v for v in views.get("reliability", []) if v["reliability"] is not None and v["reliability"] < TRUSTED]
     if doubtful:
         whose = "masks disagree" if len(doubtful) > 1 else "masks disagrees"
@@ -158,9 +161,6 @@ def warnings_of(
             f"{listed((view['name'] for view in doubtful), NOTED, written)}. Wrong ids, a wrong pose, or a mask "
             "of another image?"
         )
-    for told in (*frame_of(report), grey_ids_of(report) or renamed_ids_of(report, written)):
-        if told:
-            warnings.append(f"{told[:1].upper()}{told[1:]}.")
     names = dict(enumerate(entry["name"] for entry in report["classes"]))
     empty = {k: names[k] for k, entry in enumerate(report["classes"]) if entry["id"] and not entry["gaussians"]}
     if empty and report.get("ids"):

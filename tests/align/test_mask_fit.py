@@ -23,7 +23,7 @@ from gsseg_core.data.label_images import write_mask
 from gsseg_core.data.view import View
 from gsseg_core.export.view_pictures import background_image
 from gsseg_core.raster.backends import make_operator
-from gsseg_core.report.findings import frame_of
+from gsseg_core.report.findings import frame_of, warnings_of
 from gsseg_core.scene.gaussian_scene import GaussianScene
 
 SETTINGS = AlignSettings(views=THOROUGH)
@@ -146,11 +146,14 @@ def test_commands_say_it_where_photos_agree_with_the_scene(
     assert told == f"{found.masks.misplaced}; expected masks in the pixels of the images"
     of_old = {key: value for key, value in vars(found.masks).items() if key != "misplaced"}
     assert replace(found.masks, misplaced="") == Agreement(**of_old), "reports of earlier versions are read"
-    segment = ["segment", str(demo_run / "scene/scene.ply"), "--data", str(tmp_path), "--learner", "votes", "--quiet"]
+    segment = ["segment", str(demo_run / "scene/scene.ply"), "--data", str(tmp_path), "--quiet"]
     assert main([*segment, "--out", str(tmp_path / "out")]) == 0
     assert "padded to squares; expected masks in the pixels of the images" in capsys.readouterr().err
     report = json.loads((tmp_path / "out/report.json").read_text())
     assert "padded to squares" in report["frame"]["masks"]["misplaced"]
     assert "padded to squares" in (tmp_path / "out/report.html").read_text()
+    unused, cause, *effects = warnings_of(report, None)
+    assert "18 no mask" in unused and "padded to squares" in cause, "the cause comes first"
+    assert any("with the other views" in effect for effect in effects)
     assert main(["doctor", str(tmp_path), "--scene", str(demo_run / "scene/scene.ply"), "--quiet"]) == 2
     assert "padded to squares" in capsys.readouterr().out
