@@ -23,7 +23,7 @@ from gsseg_core.data.view import View
 PIXELS = "expected masks in the pixels of the images"
 THOROUGH = 18  # views by which masks are called misplaced; six are enough to see whether that is worth a look
 _FEWEST = 6  # of these show enough; less tells too little
-_LEAST = 0.65  # of the best correlation, below which masks are misplaced; right ones of six labels have 0.72 at least
+LEAST = 0.65  # of the best correlation, below which masks are misplaced; right ones of six labels have 0.72 at least
 _CHANCE = 0.22  # correlation that masks of something else do not reach; where right ones do not either, nothing is said
 _CLEAR = 1.35  # times the median of all changes is the best correlation at least; by chance it is 1.1 to 1.2
 _SAME = 0.8  # correlation of edges that are seen from one place; from different ones they have 0.6 at most
@@ -54,13 +54,31 @@ class _Change(NamedTuple):
 _AS_IT_IS = _Change("")
 
 
-def misplaced(pictures: Pictures, few: Sequence[Shown], views: Sequence[View], settings: AlignSettings) -> str:
-    """Say in a sentence without its stop how masks should be changed to lie on what they show; "" where they lie there.
+class MaskFit(NamedTuple):
+    """How well masks lie on what they show, by the correlation of their outlines with edges of the scene."""
 
-    `few` are masks of some of the views; where these lie beside it, more of the views are looked at.
+    as_they_are: float
+    best: float  # after a change; at least what they have as they are
+    change: str  # "" where they need none, or where none is clearly better
+
+    def __str__(self) -> str:
+        """Say in a sentence without its stop how masks would fit; "" where they do."""
+        if not self.change:
+            return ""
+        return (
+            "masks do not lie on what they show: outlines agree with edges of the scene by "
+            f"{max(self.as_they_are, 0):.2f}, and by {self.best:.2f} if masks are {self.change}"
+        )
+
+
+def misplaced(pictures: Pictures, few: Sequence[Shown], views: Sequence[View], settings: AlignSettings) -> MaskFit:
+    """See whether masks should be changed to lie on what they show.
+
+    `few` are masks of some of the views; where these seem to lie beside it, more of the views are looked at.
     """
-    if not how_they_lie(pictures, few, fewest=1):
-        return ""
+    seems = how_they_lie(pictures, few, fewest=1)
+    if seems.as_they_are >= LEAST * seems.best:
+        return seems._replace(change="")
     return how_they_lie(pictures, masks_of(views, replace(settings, views=THOROUGH)))
 
 
@@ -70,16 +88,16 @@ def masks_of(views: Sequence[View], settings: AlignSettings) -> list[Shown]:
     return [mask for mask in shown if mask.labels is not None and mask.telling]
 
 
-def how_they_lie(pictures: Pictures, shown: Sequence[Shown], fewest: int = _FEWEST) -> str:
-    """Say as `misplaced` how some masks lie; nothing of fewer than `fewest`."""
+def how_they_lie(pictures: Pictures, shown: Sequence[Shown], fewest: int = _FEWEST) -> MaskFit:
+    """Compare the masks among some views with edges of the scene; of fewer than `fewest`, nothing is found."""
     shown, seen = _from_different_places(pictures, [mask for mask in shown if mask.labels is not None and mask.telling])
     if len(shown) < max(fewest, 1):
-        return ""
+        return MaskFit(0.0, 0.0, "")
     side = len(shown[0].edges)
     padded, reach = (side + side // 3,) * 2, int(_REACH * side)
     shifts = np.arange(-reach, reach + 1)
     edges = [np.fft.rfft2(each, padded) for each in seen]
-    as_it_is, best, found, moved, every = 0.0, 0.0, _AS_IT_IS, np.zeros(2), list[float]()
+    as_they_are, best, found, moved, every = 0.0, 0.0, _AS_IT_IS, np.zeros(2), list[float]()
     for change in _changes(shown[0].seen):
         laid = [np.fft.rfft2(_centred(change.of(view.edges), view.seen), padded) for view in shown]
         product = sum(edge * one.conj() for edge, one in zip(edges, laid, strict=True))
@@ -87,16 +105,13 @@ def how_they_lie(pictures: Pictures, shown: Sequence[Shown], fewest: int = _FEWE
         row, column = np.unravel_index(scores.argmax(), scores.shape)
         every.append(float(scores.max()))
         if change is _AS_IT_IS:
-            as_it_is = float(scores[reach, reach])
+            as_they_are = float(scores[reach, reach])
         if every[-1] > best:
             best, found, moved = every[-1], change, np.array([shifts[column], shifts[row]]) / side
     by_chance = best < max(_CHANCE, _CLEAR * float(np.median(every)))
-    if by_chance or as_it_is >= _LEAST * best or (found is _AS_IT_IS and np.abs(moved).max() < _NEAR):
-        return ""
-    return (
-        f"masks do not lie on what they show: outlines agree with edges of the scene by {max(as_it_is, 0):.2f}, and by "
-        f"{best:.2f} if masks are {_said(found, moved)}"
-    )
+    if by_chance or as_they_are >= LEAST * best or (found is _AS_IT_IS and np.abs(moved).max() < _NEAR):
+        return MaskFit(as_they_are, best, "")
+    return MaskFit(as_they_are, best, _said(found, moved))
 
 
 def _from_different_places(pictures: Pictures, shown: Sequence[Shown]) -> tuple[list[Shown], list[np.ndarray]]:

@@ -12,7 +12,7 @@ from typing import Any
 from gsseg_core.align.agreement import Agreement, Pictures, Shown, agreement, far_off, look_at
 from gsseg_core.align.conventions import Alignment, find_convention
 from gsseg_core.align.features import PhotosInScene
-from gsseg_core.align.mask_fit import PIXELS, masks_of, misplaced
+from gsseg_core.align.mask_fit import LEAST, PIXELS, MaskFit, how_they_lie, masks_of, misplaced
 from gsseg_core.align.settings import AlignSettings
 from gsseg_core.data.camera_files import frame_of_training
 from gsseg_core.data.camera_formats.dataparser import DATAPARSER
@@ -57,7 +57,12 @@ class Placed:
     def fits(self) -> bool:
         """Whether nothing had to be found: cameras and masks were where they should be."""
         placed = self.agreement and self.agreement.agrees and not (self.found and self.found.alignment.parts)
-        return bool(placed and not (self.masks and self.masks.misplaced))
+        return bool(placed and not self.misplaced)
+
+    @property
+    def misplaced(self) -> str:
+        """How masks lie beside what they show; "" where they do not."""
+        return next((each.misplaced for each in (self.masks, self.agreement) if each and each.misplaced), "")
 
     def describe(self) -> str:
         """Say what was found, for people."""
@@ -72,8 +77,8 @@ class Placed:
             lines += [f"too small: {nearness}"]
         if self.found.offset_px is not None:
             lines += [f"photos and renderings are {self.found.offset_px:.2f} px apart (median of their features)"]
-        if self.masks and self.masks.misplaced:
-            lines += [f"{self.masks.misplaced}; {PIXELS}"]
+        if self.misplaced:
+            lines += [f"{self.misplaced}; {PIXELS}"]
         return "\n".join(lines)
 
     def as_dict(self) -> dict[str, Any]:
@@ -109,26 +114,20 @@ def place(
     views = dataset.views("train") or dataset.views()
     if not align and not check:
         return Placed(dataset, file)
-    pictures, seen = Pictures.of(scene, settings, device), None
+    pictures = Pictures.of(scene, settings, device)
     if align:
         found = _find_alignment(scene, views, pictures, settings, progress)
-        dataset, seen = dataset.moved(found.alignment.camera), found.agreement
+        dataset = dataset.moved(found.alignment.camera)
         views = dataset.views("train") or dataset.views()
-    else:
-        seen = _compare(pictures, look_at(views, settings), views, settings)
-    photos_fit = seen is not None and bool(seen.agrees) and seen.compared == "photos"
-    masks = _compare(pictures, masks_of(views, settings), views, settings) if photos_fit else None
+    shown, masks = look_at(views, settings), None
+    seen = found.agreement if found else agreement(pictures, shown, settings)
+    if seen and seen.compared == "masks":
+        seen = replace(seen, misplaced=str(misplaced(pictures, shown, views, settings)))
+    elif seen and seen.agrees:
+        drawn = masks_of(views, settings)
+        if masks := agreement(pictures, drawn, settings):
+            masks = replace(masks, misplaced=str(misplaced(pictures, drawn, views, settings)))
     return Placed(dataset, file, found, seen, masks)
-
-
-def _compare(
-    pictures: Pictures, shown: Sequence[Shown], views: Sequence[View], settings: AlignSettings
-) -> Agreement | None:
-    """Compare a scene with what some of the views show, and see how masks lie on it; None if they show nothing."""
-    found = agreement(pictures, shown, settings)
-    if found is None or found.compared == "photos":
-        return found
-    return replace(found, misplaced=misplaced(pictures, shown, views, settings))
 
 
 def find_alignment(
@@ -176,7 +175,9 @@ def _find_alignment(
     alignment = Alignment(find_convention(pictures, shown, settings, progress))
     reached = search.through(alignment)
     # Of a thousand conventions, the best agrees with masks a little better than the right one by chance.
-    better = search.has_photos or reached.margin >= before.margin + settings.mask_margins[0]
+    better = search.has_photos or (
+        reached.margin >= before.margin + settings.mask_margins[0] and not search.masks_are_beside(alignment)
+    )
     if before.agrees and not better:
         return Found(Alignment(), before, before)
     if reached.agrees and better:
@@ -185,9 +186,10 @@ def _find_alignment(
             return by_convention
         agreeing.append(by_convention)
     if not search.has_photos:
+        how = f"; {search.masks}" if search.masks.change else ""
         raise AlignmentError(
             f"alignment: no convention of axes has scene and masks agree ({reached} at best; cameras as they are: "
-            f"{before}); expected photos of the views in images/, by which scale, rotation and translation can be "
+            f"{before}){how}; expected photos of the views in images/, by which scale, rotation and translation can be "
             "found, too"
         )
     try:
@@ -237,6 +239,20 @@ class _Search:
             "and a translation"
         )
 
+    @cached_property
+    def masks(self) -> MaskFit:
+        """How masks lie on what they show from the cameras where they were."""
+        return misplaced(self.pictures, self.shown, self.views, self.settings)
+
+    def masks_are_beside(self, alignment: Alignment) -> bool:
+        """Whether masks would lie better on what they show after a change of their own than by an alignment."""
+        aligned = how_they_lie(self.pictures, self.moved(alignment), fewest=1)
+        return bool(self.masks.change) and aligned.as_they_are < LEAST * self.masks.best
+
+    def moved(self, alignment: Alignment) -> list[Shown]:
+        """Give what views show from cameras that are moved."""
+        return [replace(view, camera=alignment.camera(view.camera)) for view in self.shown]
+
     def closer(self, alignment: Alignment, reached: Agreement) -> Found:
         """Refine an alignment by the photos, if there are any and they are not yet close to the renderings."""
         if not self.has_photos:
@@ -253,8 +269,7 @@ class _Search:
 
     def through(self, alignment: Alignment) -> Agreement:
         """Compare the scene with what views show, after their cameras are moved."""
-        moved = [replace(view, camera=alignment.camera(view.camera)) for view in self.shown]
-        compared = agreement(self.pictures, moved, self.settings)
+        compared = agreement(self.pictures, self.moved(alignment), self.settings)
         assert compared is not None
         return compared
 

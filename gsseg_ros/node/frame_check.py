@@ -31,7 +31,7 @@ class FrameCheck:
                 "optical frame (x right, y down, z forward) in map_frame, and scene_to_map to say where the scene lies "
                 "there"
             )
-        elif told := misplaced(pictures, shown, outcome.views, _SETTINGS):
+        elif told := str(misplaced(pictures, shown, outcome.views, _SETTINGS)):
             said = f"{told}; {PIXELS}, and poses of a calibrated camera at the stamps of its masks"
         self._found = session.era, said
         return said

@@ -21,6 +21,7 @@ from gsseg_core.cli.main import main
 from gsseg_core.data.dataset import Dataset
 from gsseg_core.data.label_images import write_mask
 from gsseg_core.data.view import View
+from gsseg_core.errors import AlignmentError
 from gsseg_core.export.view_pictures import background_image
 from gsseg_core.raster.backends import make_operator
 from gsseg_core.report.findings import frame_of, warnings_of
@@ -80,7 +81,7 @@ def changed(view: View, change: Change) -> View:
 @pytest.mark.parametrize("name", CHANGES)
 def test_it_is_said_how_masks_would_lie_on_what_they_show(name: str, data: Dataset, pictures: Pictures) -> None:
     change, said = CHANGES[name]
-    told = how_they_lie(pictures, look_at([changed(view, change) for view in data.views("train")], SETTINGS))
+    told = str(how_they_lie(pictures, look_at([changed(view, change) for view in data.views("train")], SETTINGS)))
     assert told.startswith("masks do not lie on what they show: outlines agree with edges of the scene by 0.")
     assert re.search(said, told)
 
@@ -89,17 +90,19 @@ def test_nothing_is_said_of_masks_that_lie_there_of_masks_of_anything_else_and_o
     data: Dataset, pictures: Pictures
 ) -> None:
     views = data.views("train")
-    assert how_they_lie(pictures, look_at(views, SETTINGS)) == ""
+    assert how_they_lie(pictures, look_at(views, SETTINGS)).change == ""
     rng = np.random.default_rng(0)
     blobs = [np.kron(rng.integers(0, 9, (5, 8)), np.ones((60, 50), int)).astype(np.int32) for _ in views]
     elsewhere = [View.from_arrays(view.camera, blob) for view, blob in zip(views, blobs, strict=True)]
-    assert how_they_lie(pictures, look_at(elsewhere, SETTINGS)) == ""
+    assert how_they_lie(pictures, look_at(elsewhere, SETTINGS)).change == ""
     mirrored = [changed(view, CHANGES["mirrored"][0]) for view in views]
-    assert how_they_lie(pictures, look_at(mirrored[::6], SETTINGS)) == ""
-    assert how_they_lie(pictures, look_at(mirrored[::5], SETTINGS)) != ""
-    assert how_they_lie(pictures, look_at(mirrored[::5] * 3, SETTINGS)) != ""
-    assert how_they_lie(pictures, look_at(mirrored[::6] * 3, SETTINGS)) == "", "more from the same places tell no more"
-    assert how_they_lie(pictures, [], 0) == ""
+    assert how_they_lie(pictures, look_at(mirrored[::6], SETTINGS)).change == ""
+    assert how_they_lie(pictures, look_at(mirrored[::5], SETTINGS)).change != ""
+    assert how_they_lie(pictures, look_at(mirrored[::5] * 3, SETTINGS)).change != ""
+    assert how_they_lie(pictures, look_at(mirrored[::6] * 3, SETTINGS)).change == "", (
+        "more from the same places tell no more"
+    )
+    assert how_they_lie(pictures, [], 0).change == ""
 
 
 def test_masks_of_real_scenes_as_they_came_lie_on_what_they_show(real_data: Path) -> None:
@@ -110,9 +113,8 @@ def test_masks_of_real_scenes_as_they_came_lie_on_what_they_show(real_data: Path
                 masks = place(scene, Dataset(real_data / name, labels), check=True).masks
                 assert masks is not None and masks.agrees and not masks.misplaced, (name, labels, masks)
         views = Dataset(real_data / name, "labels_noisy").views("train")
-        told = how_they_lie(
-            Pictures.of(scene, SETTINGS), look_at([changed(view, CHANGES["moved"][0]) for view in views], SETTINGS)
-        )
+        beside = look_at([changed(view, CHANGES["moved"][0]) for view in views], SETTINGS)
+        told = str(how_they_lie(Pictures.of(scene, SETTINGS), beside))
         assert "if masks are moved by" in told and " % left " in told, (name, told)
 
 
@@ -120,9 +122,12 @@ def test_without_photos_it_may_be_the_cameras_too(demo_run: Path, data: Dataset,
     shutil.copy(data.root / "cameras.json", tmp_path)
     for view in data.views("train"):
         write_mask(tmp_path / f"labels/{view.name}.png", changed(view, moved).read_labels(), 8)
-    found = place(GaussianScene.load(demo_run / "scene/scene.ply"), Dataset(tmp_path), check=True)
+    scene = GaussianScene.load(demo_run / "scene/scene.ply")
+    found = place(scene, Dataset(tmp_path), check=True)
     assert found.agreement is not None and found.masks is None and not found.fits
     assert "if masks are moved by" in found.agreement.misplaced
+    with pytest.raises(AlignmentError, match=r"masks do not lie on what they show: .* if masks are moved by"):
+        place(scene, Dataset(tmp_path), align=True)  # Among all conventions, one would agree by chance.
     told = frame_of({"scene": {}, "frame": found.as_dict()})
     assert len(told) == 1 + (found.agreement.agrees is False)
     assert told[-1].endswith("; expected masks in the pixels of the images, and cameras that fit the scene")
