@@ -78,7 +78,7 @@ def misplaced(pictures: Pictures, few: Sequence[Shown], views: Sequence[View], s
     """
     seems = how_they_lie(pictures, few, fewest=1)
     if seems.as_they_are >= LEAST * seems.best:
-        return seems._replace(change="")
+        return seems
     return how_they_lie(pictures, masks_of(views, replace(settings, views=THOROUGH)))
 
 

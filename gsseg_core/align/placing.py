@@ -114,19 +114,22 @@ def place(
     views = dataset.views("train") or dataset.views()
     if not align and not check:
         return Placed(dataset, file)
-    pictures = Pictures.of(scene, settings, device)
+    pictures, seen = Pictures.of(scene, settings, device), None
+    shown, masks = list[Shown](), None
     if align:
         found = _find_alignment(scene, views, pictures, settings, progress)
-        dataset = dataset.moved(found.alignment.camera)
+        dataset, seen = dataset.moved(found.alignment.camera), found.agreement
         views = dataset.views("train") or dataset.views()
-    shown, masks = look_at(views, settings), None
-    seen = found.agreement if found else agreement(pictures, shown, settings)
+    else:
+        shown = look_at(views, settings)
+        seen = agreement(pictures, shown, settings)
     if seen and seen.compared == "masks":
-        seen = replace(seen, misplaced=str(misplaced(pictures, shown, views, settings)))
+        few = shown or masks_of(views, settings)
+        seen = replace(seen, misplaced=str(misplaced(pictures, few, views, settings)))
     elif seen and seen.agrees:
-        drawn = masks_of(views, settings)
-        if masks := agreement(pictures, drawn, settings):
-            masks = replace(masks, misplaced=str(misplaced(pictures, drawn, views, settings)))
+        few = masks_of(views, settings)
+        if masks := agreement(pictures, few, settings):
+            masks = replace(masks, misplaced=str(misplaced(pictures, few, views, settings)))
     return Placed(dataset, file, found, seen, masks)
 
 
@@ -246,8 +249,9 @@ class _Search:
 
     def masks_are_beside(self, alignment: Alignment) -> bool:
         """Whether masks would lie better on what they show after a change of their own than by an alignment."""
-        aligned = how_they_lie(self.pictures, self.moved(alignment), fewest=1)
-        return bool(self.masks.change) and aligned.as_they_are < LEAST * self.masks.best
+        if not self.masks.change:
+            return False
+        return how_they_lie(self.pictures, self.moved(alignment), fewest=1).as_they_are < LEAST * self.masks.best
 
     def moved(self, alignment: Alignment) -> list[Shown]:
         """Give what views show from cameras that are moved."""
