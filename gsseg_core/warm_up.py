@@ -41,6 +41,7 @@ from gsseg_core.scene.gaussian_scene import GaussianScene
 from gsseg_core.scene.harmonics_kernel import seen_colors
 from gsseg_core.scene.spherical_harmonics import basis
 from gsseg_core.segmentation import Segmentation
+from gsseg_core.spatial.kd_tree import Tree
 from gsseg_core.spatial.neighbour_graph import graph_of
 from gsseg_core.spatial.row_order import in_curve_order
 
@@ -50,7 +51,7 @@ EVERY_RUN = (
 )
 NOT_KEPT = f"some kernels could not be kept, is the disk full? Every run compiles them; {kernel_cache.REMEDY}"
 
-SIDE = 72  # Gaussians on a side of the square; trees of fewer than 4,096 in all are built by other kernels
+SIDE = 72  # Gaussians on a side of the square; trees of fewer than 4,096 are built by one thread
 
 _warm: set[str] = set()  # the devices for which all kernels are there
 
@@ -165,7 +166,8 @@ def _learn_something(device: str) -> None:
 def refine_something(device: str = "cpu") -> None:
     """Do all with a small scene that needs nothing learnt: align boundaries, spread labels, refine, carve, render."""
     scene, camera, labels = _square()
-    wide, true = (np.pad(np.ones((32 - 2 * margin, 32 - 2 * margin), np.int32), margin) for margin in (10, 12))
+    # Long enough an outline, as few pixels of it tell too little for it to be moved.
+    wide, true = (np.pad(np.ones((48 - 2 * margin, 48 - 2 * margin), np.int32), margin) for margin in (8, 10))
     edges = sum(np.abs(np.diff(true, axis=axis, prepend=0)) for axis in (0, 1))
     align_boundaries(wide, 3 * np.asarray(edges, np.float32), EMSettings.edge_px)  # The region's outline moves.
     merge_tree(labels[..., None])  # as for points in a view
@@ -175,6 +177,7 @@ def refine_something(device: str = "cpu") -> None:
     share = np.clip(0.5 + scene.means[:, 0], 0.05, 0.95)  # Unsure in the middle, where neighbours decide.
     codes = np.stack([1 - share, share], axis=1).astype(np.float32)
     propagate(graph_of(scene), codes, np.zeros(len(codes)))
+    Tree.build(scene.means[:1])  # of few Gaussians, by one thread
     result = Segmentation.from_codes(scene, codes, {0: "left", 1: "right"}, PAPER).carved(scene, [camera])
     operator = make_operator(scene, camera, device)
     result.calibrated(2.0).render(operator)
