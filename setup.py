@@ -49,7 +49,7 @@ setup(
         "numpy>=1.26",
         "pillow>=10.1",
         "plyfile>=1.0",
-        "pycolmap>=4.2",
+        'pycolmap>=4.2; platform_machine != "aarch64"',  # which it has no wheel for; only `--align` by photos needs it
         "scipy>=1.11",
         "shtab>=1.8",
         "torch>=2.3",
@@ -61,7 +61,7 @@ setup(
             "distributed>=2024.8",
             "gaussforge>=0.6",
             "greenlet>=3.0",
-            "gsply>=0.4.6",
+            'gsply>=0.4.6; platform_machine != "aarch64"',  # where it is compiled, by tools that are not pinned
             "hypothesis>=6.100",
             "import-linter>=2.5",
             "mkdocs-material>=9.6",

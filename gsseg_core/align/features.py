@@ -6,6 +6,7 @@ a pixel of that photo and a point of the scene.
 
 from __future__ import annotations
 
+import platform
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any, NamedTuple
@@ -47,9 +48,9 @@ class Extractor:
         try:
             import pycolmap
         except ModuleNotFoundError as missing:
-            raise AlignmentError(
-                "locating photos in a scene needs pycolmap, which is missing: pip install pycolmap"
-            ) from missing
+            arm = platform.machine() == "aarch64"  # as in setup.py
+            how = "there is no wheel of it for ARM, so build it from COLMAP's source" if arm else "pip install pycolmap"
+            raise AlignmentError(f"locating photos in a scene needs pycolmap, which is missing: {how}") from missing
         pycolmap.logging.minloglevel = max(pycolmap.logging.minloglevel, 1)  # It logs every extractor that it makes.
         options = pycolmap.FeatureExtractionOptions()
         options.use_gpu, options.num_threads = False, 1

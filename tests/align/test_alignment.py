@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import shutil
-import sys
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -19,7 +18,7 @@ from gsseg_core.align import agreement as comparison
 from gsseg_core.align import conventions, placing
 from gsseg_core.align.agreement import Agreement, Pictures, agreement, look_at, render, thinned
 from gsseg_core.align.conventions import AXIS_ROTATIONS, OPENGL, Convention
-from gsseg_core.align.features import Extractor, Features, Photo
+from gsseg_core.align.features import Features, Photo
 from gsseg_core.align.placing import Found, find_alignment, place
 from gsseg_core.align.registration import Located, fit_poses
 from gsseg_core.align.settings import AlignSettings
@@ -391,9 +390,3 @@ def test_segment_warns_in_one_line_of_cameras_that_do_not_fit_and_align_mends_it
     for given, notes in (([], 1), (["--align"], 0)):  # Without, it renders the scene from where no camera was.
         assert main(["render", scene, "--data", str(turned), *found, "--quiet", *given]) == 0
         assert capsys.readouterr().err.count("that run moved the cameras by --align (") == notes
-
-
-def test_a_missing_pycolmap_is_one_error_that_says_what_to_type(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setitem(sys.modules, "pycolmap", None)
-    with pytest.raises(AlignmentError, match="needs pycolmap, which is missing: pip install pycolmap"):
-        Extractor(SETTINGS)

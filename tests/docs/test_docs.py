@@ -23,6 +23,7 @@ import pytest
 from doc_blocks import FENCE, FIRST, PAGES, REPOSITORY, Block, blocks_of, needs_ros
 from doc_commands import Started, check, core_libraries, kind_of, run_commands, setup_py, words_of
 from missing_ros import MISSING
+from packaging.requirements import Requirement
 
 from gsseg_core.cli.arguments import COMMANDS, command_module
 from gsseg_core.data.dataset import Dataset
@@ -200,6 +201,12 @@ def test_a_robot_gets_every_library_from_apt_or_by_pip_or_is_told_when_it_is_nee
     missing = core_libraries() - by_apt - {re.split("[<>]", word)[0] for word in by_pip}
     assert missing == {"pycolmap", "shtab", "torch"}
     assert all(name in (REPOSITORY / "docs" / "tutorial_robot.md").read_text() for name in missing)
+
+
+def test_on_arm_pip_is_asked_for_nothing_that_has_no_wheel_there() -> None:
+    asked = map(Requirement, setup_py()["install_requires"])
+    skipped = {one.name for one in asked if one.marker and not one.marker.evaluate({"platform_machine": "aarch64"})}
+    assert skipped == {"pycolmap"}
 
 
 @pytest.mark.parametrize("page", PAGES)
