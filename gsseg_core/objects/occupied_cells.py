@@ -32,10 +32,11 @@ def occupied_cells(
     """
     if not 0 < size < np.inf:
         raise SettingsError(f"size of a cell is {size}; expected a number above 0")
-    keys, heights = [np.empty((0, 2), np.int64)], [np.empty(0)]
+    # Cells are numbered in floats: those that an endless Gaussian reaches are beyond all integers.
+    keys, heights = [np.empty((0, 2))], [np.empty(0)]
     for points in samples(np.asarray(means, np.float64), np.asarray(half_axes, np.float64), size):
         points = points[(points[:, 2] >= low) & (points[:, 2] <= high)]
-        cells, z = _lowest(np.floor(points[:, :2] / size).astype(np.int64), points[:, 2])
+        cells, z = _lowest(np.floor(points[:, :2] / size), points[:, 2])
         keys.append(cells)
         heights.append(z)
     cells, z = _lowest(np.concatenate(keys), np.concatenate(heights))
@@ -43,9 +44,9 @@ def occupied_cells(
 
 
 def _lowest(
-    cells: npt.NDArray[np.int64],  # (n, 2)
+    cells: npt.NDArray[np.float64],  # (n, 2)
     heights: npt.NDArray[np.float64],  # (n,)
-) -> tuple[npt.NDArray[np.int64], npt.NDArray[np.float64]]:
+) -> tuple[npt.NDArray[np.float64], npt.NDArray[np.float64]]:
     """Each cell once, in order, with its least height."""
     order = np.lexsort((heights, cells[:, 1], cells[:, 0]))
     cells, heights = cells[order], heights[order]

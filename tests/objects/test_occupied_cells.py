@@ -90,3 +90,8 @@ def test_no_gaussians_occupy_nothing() -> None:
 def test_a_huge_gaussian_takes_no_more_memory_than_others() -> None:
     cells = occupied_cells(np.zeros((1, 3)), np.diag([1e4, 1e4, 1e4])[None], SIZE, -1e9, 1e9)
     assert 0 < len(cells) <= 64**2
+
+
+def test_an_endless_gaussian_reaches_as_far_to_one_side_as_to_the_other() -> None:
+    cells = occupied_cells(np.zeros((1, 3)), np.diag([1e30, 0.1, 0.1])[None], SIZE, -1, 1)
+    assert [cells[:, 0].min(), cells[:, 0].max()] == pytest.approx([-1e30, 1e30], rel=0.1)
