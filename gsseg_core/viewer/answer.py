@@ -94,9 +94,10 @@ class Answer:
                     self._answer.content = paragraph(_ASK)
 
     def _show_offered(self, client: viser.ClientHandle | None, show: Callable[[int], None]) -> None:
-        with self.telling(client):
-            if self._node is not None:
-                show(self._node)
+        node = self._node  # Another browser may click on something else meanwhile, or choose a level.
+        with self.telling(client), self._state.lock:
+            if node is not None:
+                show(node)
                 self._level_changed()
 
     def _offer(self, node: int | None) -> None:

@@ -12,7 +12,7 @@ import viser
 
 from gsseg_core.data.class_names import class_name
 from gsseg_core.data.view import View
-from gsseg_core.errors import GssegError, SettingsError
+from gsseg_core.errors import GssegError, SettingsError, UnknownLabelError
 from gsseg_core.export.collision import KINDS
 from gsseg_core.scene.camera import Camera
 from gsseg_core.scene.scene_writers import SCENE_WRITERS
@@ -85,8 +85,9 @@ class Panel:
         self._level = self._gui.add_dropdown("show", names, initial_value=tree.level_name(tree.level))
 
         def choose(event: Event) -> None:
-            if event.client is not None:  # Else it was set from here.
-                self._state.set_level(self._levels[names[_chosen(self._level, names)]])
+            with self._state.lock:  # Whoever comes last, it is what was chosen last.
+                if event.client is not None:  # Else it was set from here.
+                    self._state.set_level(self._levels[names[_chosen(self._level, names)]])
 
         self._on(self._level.on_update, choose)
 
@@ -110,14 +111,15 @@ class Panel:
 
         def choose_mode(_: Event) -> None:
             try:
-                self._state.set_mode(mode.value, self.answer.show_progress)
+                while mode.value != self._state.model.mode:  # Another may be chosen while votes are collected.
+                    self._state.set_mode(mode.value, self.answer.show_progress)
             except GssegError:
                 _set(mode, self._state.model.mode)
                 raise
 
         def set_threshold(name: str, slider: viser.GuiSliderHandle[float]) -> None:
-            value = _number(slider, 0, 1)
-            self._state.change(lambda model: setattr(model, name, value))
+            # It is read where no other thread can set what it said before.
+            self._state.change(lambda model: setattr(model, name, _number(slider, 0, 1)))
 
         def show(_: Event) -> None:
             self._state.change(lambda model: model.show_all())
@@ -187,7 +189,14 @@ class Panel:
 
         def pressed(_: Event) -> None:
             action = {ONLY: ViewModel.isolate, REMOVE: ViewModel.remove}.get(self._press.value, ViewModel.toggle)
-            self._state.change(lambda model: action(model, row.label))
+
+            def act(model: ViewModel) -> None:
+                if model.name(row.label) != row.name:  # Another class has the number by now, as on another level.
+                    name = shown_name(row.name)
+                    raise UnknownLabelError(f"class {name!r} is not in the list any more; expected one that is")
+                action(model, row.label)
+
+            self._state.change(act)
 
         self._on(button.on_click, pressed)
         return button
@@ -240,21 +249,25 @@ class Panel:
 
     def correct_at(self, camera: Camera, column: float, row: float) -> None:
         """Correct what a click hit, in pixels of the camera."""
+        # An earlier correction may last, and people choose what comes next meanwhile.
+        target, tool = self._target.value, self._tool.value
+        radius = _number(self._radius, 0, 100) / 100 * camera.height if tool == DISC else 0.0
         with self._state.lock:  # Classes may get other numbers meanwhile.
-            label, model = self._label(), self._state.model
-            if self._tool.value == REGION:
+            label, model = self._label(target), self._state.model
+            if tool == REGION:
                 drawn = region(camera, self._state.label_map(camera), column, row, label)
-            elif self._tool.value == ALIKE:
+            elif tool == ALIKE:
                 seen = model.scene.subset(model.shown())
                 drawn = looks_alike(seen, camera, column, row, label, device=self._state.device)
             else:
-                drawn = disc(camera, column, row, _number(self._radius, 0, 100) / 100 * camera.height, label)
+                drawn = disc(camera, column, row, radius, label)
             self._correct(drawn)
 
     def correct_box(self, camera: Camera, corner: Sequence[float], opposite: Sequence[float]) -> None:
         """Correct what is in a box between two corners, column and row in pixels of the camera."""
+        target = self._target.value
         with self._state.lock:
-            self._correct(box(camera, corner, opposite, self._label()))
+            self._correct(box(camera, corner, opposite, self._label(target)))
 
     def _correct_clicked(self, event: Event) -> None:
         place = None if event.client is None else self.clicked.get(event.client)
@@ -269,8 +282,8 @@ class Panel:
         count = counted(len(self._state.corrections), "correction")
         self._corrected.content = f"{count}; the last one changed {changed:,} Gaussians."
 
-    def _label(self) -> int:
-        return _chosen(self._target, self._target_names())
+    def _label(self, target: str) -> int:
+        return _chosen(self._target, self._target_names(), target)
 
     def _add_class(self) -> None:
         name = printable(self._new.value.strip())
@@ -322,11 +335,12 @@ def _number(slider: viser.GuiSliderHandle[float], lowest: float, highest: float)
     return value
 
 
-def _chosen(dropdown: viser.GuiDropdownHandle[str], options: Sequence[str]) -> int:
-    """Which of the options is chosen; a browser may say anything."""
-    if dropdown.value not in options:
-        raise SettingsError(f"{dropdown.label} is {shown_name(dropdown.value)!r}; expected one of the list")
-    return options.index(dropdown.value)
+def _chosen(dropdown: viser.GuiDropdownHandle[str], options: Sequence[str], earlier: str | None = None) -> int:
+    """Which of the options is chosen, or was chosen `earlier`; a browser may say anything."""
+    value = dropdown.value if earlier is None else earlier
+    if value not in options:
+        raise SettingsError(f"{dropdown.label} is {shown_name(value)!r}; expected one of the list")
+    return options.index(value)
 
 
 def _distinct(texts: Sequence[str], numbers: Sequence[int] = ()) -> tuple[str, ...]:

@@ -26,6 +26,7 @@ from gsseg_core.scene.camera import Camera
 from gsseg_core.segmentation import Segmentation
 from gsseg_core.viewer import corrections as view_corrections
 from gsseg_core.viewer import model as view_model
+from gsseg_core.viewer import panel as view_panel
 from gsseg_core.viewer.access import listen
 from gsseg_core.viewer.clients import SERVER
 from gsseg_core.viewer.corrections import disc
@@ -160,7 +161,7 @@ def test_the_class_that_corrections_are_for_stays_chosen_under_another_name_and_
     target.value = NAMES[3]
     viewer.state.replace(replace(LEARNT, class_names={**NAMES, 3: "bottle"}))
     wait_until(lambda: target.value != NAMES[3], "the other name")
-    assert target.value == "bottle" and panel._label() == 3
+    assert target.value == "bottle" and panel._label(target.value) == 3
     viewer.state.replace(Labelling.unknown(len(SCENE)))
     wait_until(lambda: len(target.options) == 1, "the classes that are left")
     with panel.answer.telling(None):
@@ -185,6 +186,30 @@ def test_levels_of_nearly_one_granularity_can_all_be_chosen_and_opened() -> None
             viewer.state.show_parts(node)
             viewer.panel._show_level()
             assert viewer.panel._levels[viewer.panel._level.value] == viewer.state.granularity
+
+
+def test_a_level_that_is_chosen_while_parts_are_shown_is_the_one_that_is_shown(
+    viewer: Viewer, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    panel, viewed, set_to = viewer.panel, viewer.state, view_panel._set
+    coarsest = next(iter(panel._levels))
+
+    def choose() -> None:
+        panel._level._impl.value = coarsest  # as viser does where a browser says so
+        for callback in panel._level._impl.update_cb:
+            callback(MagicMock())
+
+    at_once = meanwhile(viewed, choose)
+
+    def set_late(*of: Any) -> None:
+        at_once()
+        set_to(*of)
+
+    monkeypatch.setattr(view_panel, "_set", set_late)
+    panel.answer._node = 1
+    panel.answer._show_offered(None, viewed.show_parts)
+    at_once()
+    assert viewed.granularity == panel._levels[panel._level.value] == panel._levels[coarsest]
 
 
 def test_a_scene_of_one_gaussian_is_looked_at_from_outside() -> None:
