@@ -96,7 +96,9 @@ class ViewerState:
 
     def show_parts(self, node: int) -> None:
         """Show the parts of a node, alone, where it has any."""
-        self.set_level(self._tree().opened(node), node)
+        tree = self._tree()
+        if tree.parts(node):
+            self.set_level(tree.opened(node), node)
 
     def show_whole(self, node: int) -> None:
         """Show what a node is a part of, alone, where that is anything."""

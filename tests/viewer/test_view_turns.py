@@ -122,6 +122,16 @@ def test_the_level_that_was_chosen_last_is_shown(viewer: Viewer) -> None:
     assert state.granularity == levels[level.value] == levels[fine]
 
 
+def test_parts_of_what_has_none_are_not_shown_though_a_browser_still_offers_those_of_something_else(
+    viewer: Viewer,
+) -> None:
+    state, answer = viewer.state, viewer.panel.answer
+    state.change(lambda model: model.toggle(3))
+    answer._node = 2  # which another browser has clicked on meanwhile
+    told(answer._parts)
+    assert state.granularity == 0.5 and state.model.hidden == {3}
+
+
 @pytest.mark.parametrize("name", ["confidence", "probability"])
 def test_a_slider_that_is_dragged_on_acts_as_it_stands_last(viewer: Viewer, name: str) -> None:
     state, slider = viewer.state, widget(viewer, name)
