@@ -30,6 +30,7 @@ from gsseg_core.viewer.corrections import Corrections
 from gsseg_core.viewer.model import BY_RELIABILITY, MODES, ClassRow, Labelling, ViewModel, at_level, completed
 from gsseg_core.viewer.picking import ViewVotes
 from gsseg_core.viewer.picture import Picture, cut
+from gsseg_core.viewer.turns import Turns
 
 
 class ViewerState:
@@ -46,7 +47,7 @@ class ViewerState:
         self.granularity = model.tree.level if model.tree else 0.0  # ... of which the model shows this level of a tree
         self._view_votes: ViewVotes | None = None
         self._view_votes_lock = threading.Lock()
-        self.lock = threading.RLock()  # held by whoever needs that nothing of this changes meanwhile
+        self.lock = Turns()  # held by whoever needs that nothing of this changes meanwhile
         self._parts = cut(model.labelling.labels, model.labelling.confidence)
 
     def seen(self) -> tuple[Picture, list[ClassRow]]:

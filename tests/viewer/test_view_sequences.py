@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import threading
 from collections.abc import Callable, Iterator
 from contextlib import closing
 from dataclasses import replace
@@ -58,12 +57,9 @@ def meanwhile(viewed: ViewerState, action: Callable[[], object]) -> Callable[[],
     done: list[object] = []
 
     def do() -> None:
-        try:
-            threading.Condition(viewed.lock).notify()
-        except RuntimeError:  # Not held.
-            if not done:
-                done.append(None)
-                action()
+        if not viewed.lock.held() and not done:
+            done.append(None)
+            action()
 
     return do
 

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 from labellings import labelled
 from parts_of_balls import tree_of_balls
-from patience import PATIENCE
+from patience import PATIENCE, wait_until
 from small_scenes import NAMES, balls_on_a_table, clean_views, ring
 
 pytest.importorskip("viser")
@@ -51,10 +51,10 @@ def busy(state: ViewerState, ask: Callable[[], object]) -> Iterator[None]:
         def __enter__(self) -> None:
             if threading.current_thread() is asking:
                 waits.set()
-            lock.acquire()
+            lock.__enter__()
 
         def __exit__(self, *_: object) -> None:
-            lock.release()
+            lock.__exit__()
 
     asking = threading.Thread(target=ask)
     with lock:
@@ -64,6 +64,22 @@ def busy(state: ViewerState, ask: Callable[[], object]) -> Iterator[None]:
         yield
     asking.join()
     state.lock = lock
+
+
+def test_what_is_drawn_while_something_takes_long_is_learnt_in_its_order_and_taken_back_from_the_last() -> None:
+    state, drawn = ViewerState(ViewModel(SCENE, LEARNT), [], {}, "cpu"), [3, 1, 2, 0, 2, 3, 1, 0]
+
+    def correct(label: int) -> None:
+        state.correct(disc(CAMERA, COLUMN, ROW, 3, label))
+
+    asked = [*(threading.Thread(target=correct, args=(label,)) for label in drawn), threading.Thread(target=state.undo)]
+    with state.lock:
+        for count, one in enumerate(asked, start=1):
+            one.start()
+            wait_until(lambda count=count: len(state.lock._waiting) == count, "it to wait")  # type: ignore[misc]
+    for one in asked:
+        one.join()
+    assert [int(one.labels[0]) for one in state.corrections.drawn] == drawn[:-1]
 
 
 def widget(viewer: Viewer, label: str) -> Any:
