@@ -27,7 +27,16 @@ class Turns:
                 self._holder, self._depth = me, self._depth + 1
                 return
             self._waiting.append((me, turn))
-        turn.wait()
+        try:
+            turn.wait()
+        except BaseException:  # Ctrl-C; nobody would end this turn.
+            with self._changing:
+                waits = not turn.is_set()
+                if waits:
+                    self._waiting.remove((me, turn))
+            if not waits:
+                self.__exit__()
+            raise
 
     def __exit__(self, *_: object) -> None:
         """Let the next one have it."""

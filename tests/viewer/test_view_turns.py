@@ -23,6 +23,7 @@ from gsseg_core.viewer.corrections import Corrections, disc
 from gsseg_core.viewer.model import BY_CLASS, BY_CONFIDENCE, BY_RELIABILITY, ViewModel
 from gsseg_core.viewer.picking import ViewVotes
 from gsseg_core.viewer.state import ViewerState
+from gsseg_core.viewer.turns import Turns
 from gsseg_core.viewer.viewer import Viewer
 
 SCENE, TRUTH = balls_on_a_table()
@@ -80,6 +81,29 @@ def test_what_is_drawn_while_something_takes_long_is_learnt_in_its_order_and_tak
     for one in asked:
         one.join()
     assert [int(one.labels[0]) for one in state.corrections.drawn] == drawn[:-1]
+
+
+@pytest.mark.parametrize("had_its_turn", [False, True])
+def test_who_is_interrupted_while_waiting_keeps_nobody_waiting(
+    monkeypatch: pytest.MonkeyPatch, had_its_turn: bool
+) -> None:
+    lock = Turns()
+
+    class Interrupted(threading.Event):
+        def wait(self, timeout: float | None = None) -> bool:
+            if had_its_turn:
+                lock.__exit__()  # as the thread that holds it does, just before
+            raise KeyboardInterrupt
+
+    lock.__enter__()
+    lock._holder = -1  # another thread
+    with monkeypatch.context() as patched:
+        patched.setattr(threading, "Event", Interrupted)
+        with pytest.raises(KeyboardInterrupt):
+            lock.__enter__()
+    if not had_its_turn:
+        lock.__exit__()
+    assert lock._holder is None and not lock._waiting
 
 
 def widget(viewer: Viewer, label: str) -> Any:
