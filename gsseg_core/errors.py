@@ -37,7 +37,7 @@ class SceneDeltaError(GssegError):
 
 
 class UnknownGroupError(GssegError):
-    """A view belongs to a group that the scene has not."""
+    """A view belongs to a group that the scene does not have."""
 
 
 class CameraFileError(GssegError):

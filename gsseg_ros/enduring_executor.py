@@ -33,7 +33,7 @@ class EnduringExecutor(Executor):
                 return None
             except Exception as error:
                 name = getattr(entity, "topic_name", "") or getattr(entity, "srv_name", "") or type(entity).__name__
-                self._complain(f"{name}: what has come cannot be taken in, and is lost", error)
+                self._complain(f"{name}: what was received cannot be processed, and is lost", error)
                 return None
 
         return super()._make_handler(entity, node, taken, *rest)

@@ -34,4 +34,4 @@ def warn_of_unknown(node: Node, of_topics: bool = False) -> None:
     near = [difflib.get_close_matches(name, known, 1) for name in strange]
     said = [name + "".join(f" (did you mean {one}?)" for one in ones) for name, ones in zip(strange, near, strict=True)]
     if said:
-        node.get_logger().warning(f"parameters that this node does not have are passed over: {', '.join(said)}")
+        node.get_logger().warning(f"parameters that this node does not have are ignored: {', '.join(said)}")

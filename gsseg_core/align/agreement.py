@@ -110,9 +110,9 @@ class Agreement:
         if self.agrees:
             return ""
         if not self.telling:
-            return f"{self.compared} of so few labels cannot tell whether cameras and scene belong together"
+            return f"{self.compared} with so few labels cannot show whether the cameras fit the scene"
         looks = "hardly looks" if self.agrees is None else "does not look"
-        return f"the scene {looks} as the {self.compared} do from these cameras"
+        return f"the scene {looks} like the {self.compared} from these cameras"
 
     @property
     def nearness(self) -> str:

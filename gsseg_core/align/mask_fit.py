@@ -66,7 +66,7 @@ class MaskFit(NamedTuple):
         if not self.change:
             return ""
         return (
-            "masks do not lie on what they show: outlines agree with edges of the scene by "
+            "masks do not lie on what they show: their outlines agree with edges of the scene by "
             f"{max(self.as_they_are, 0):.2f}, and by {self.best:.2f} if masks are {self.change}"
         )
 
@@ -140,8 +140,8 @@ def _changes(seen: np.ndarray) -> Iterator[_Change]:  # (S, S) bool: pixels that
     longer = max(height, width)
     padded, cut = (longer / width, longer / height), (height / longer, width / longer)
     if max(padded) > 1 + _NEAR:
-        yield _Change("stretched, which undoes that images were padded to squares", padded)
-        yield _Change("squeezed, which undoes that squares were cut out of images", cut)
+        yield _Change("stretched, which undoes padding the images to squares", padded)
+        yield _Change("squeezed, which undoes cutting squares out of the images", cut)
 
 
 def _centred(picture: np.ndarray, seen: np.ndarray) -> np.ndarray:  # (S, S), (S, S) bool

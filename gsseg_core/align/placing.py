@@ -191,7 +191,7 @@ def _find_alignment(
     if not search.has_photos:
         how = f"; {search.masks}" if search.masks.change else ""
         raise AlignmentError(
-            f"alignment: no convention of axes has scene and masks agree ({reached} at best; cameras as they are: "
+            f"alignment: no convention of axes makes scene and masks agree ({reached} at best; cameras as they are: "
             f"{before}){how}; expected photos of the views in images/, by which scale, rotation and translation can be "
             "found, too"
         )
@@ -237,7 +237,7 @@ class _Search:
                 progress(LOOKING, count, count)
                 return Found(alignment, reached, self.before, offset_px(self.photos, alignment))
         raise AlignmentError(
-            f"alignment: no place in the scene looks as the {len(self.photos.photos)} photos do; expected photos of "
+            f"alignment: no place in the scene looks like the {len(self.photos.photos)} photos; expected photos of "
             "this scene, with structure, and poses that differ from the scene's by a convention, a scale, a rotation "
             "and a translation"
         )
@@ -291,6 +291,7 @@ def _frame_of_training(
         if not is_there(Path(given), CameraFileError):
             raise CameraFileError(f"{Path(given)}: does not exist; expected nerfstudio's {DATAPARSER}")
         raise CameraFileError(
-            f"{Path(given)}: says nothing of the cameras of {dataset.root}; expected some that nerfstudio trains from"
+            f"{Path(given)}: does not describe the cameras of {dataset.root}; expected those that nerfstudio trained "
+            "from"
         )
     return None

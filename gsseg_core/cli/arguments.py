@@ -19,7 +19,7 @@ COMMANDS = {
     "remove": "write the scene without some of its objects",
     "merge": "add up what several robots have learnt of one scene",
     "demo": "make a small scene with known truth and segment it",
-    "doctor": "say what this machine has and lacks, and how to get it",
+    "doctor": "show what this machine has, what it lacks, and how to install that",
     "completion": "print a script for tab completion",
 }
 """Each command and its line in `gsseg --help`, in this order.

@@ -98,7 +98,7 @@ def run(options: argparse.Namespace) -> int:
     """Look, and print what was found."""
     if options.scene and not options.path:
         raise SettingsError(
-            "gsseg doctor: --scene is given alone; expected a dataset, too, whose cameras are to fit it"
+            "gsseg doctor: --scene is given alone; expected a dataset as well, whose cameras should fit it"
         )
     if not options.path:
         findings = examine(note)
@@ -209,8 +209,8 @@ def works(findings: list[Finding]) -> bool:
 def describe(findings: list[Finding]) -> str:
     """Write findings as text for a terminal, group by group, and the verdict."""
     missing = sum(finding.mark == "-" for finding in findings)
-    verdict = "gsseg works here" if works(findings) else "gsseg does not work here: see what is marked !!"
-    options = f"; what is marked - ({missing}) is needed only by those who use it" if missing else ""
+    verdict = "gsseg works here" if works(findings) else "gsseg does not work here: see the lines marked !!"
+    options = f"; what is marked - ({missing}) is optional" if missing else ""
     return "\n".join([_listed(findings), "", verdict + options])
 
 

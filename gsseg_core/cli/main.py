@@ -74,7 +74,7 @@ def _refuse_empty(options: Namespace) -> None:
 
     for name, value in vars(options).items():
         if value == "" or (isinstance(value, list) and "" in value):
-            raise SettingsError(f"{name} is ''; expected something (a variable of the shell may not be set)")
+            raise SettingsError(f"{name} is ''; expected a value (is a variable of the shell unset?)")
 
 
 def _check_threads() -> None:

@@ -24,9 +24,9 @@ CANDIDATES = 24  # cameras of which the next view is chosen, spread over all, as
 
 DESCRIPTION = """
 Finds the Gaussians of one object that is shown by a mask of one view, or of a few, and writes it as DIR/object.ply, or
-another file, with the indices in DIR/pick.npz and a picture of the first view. Needs no other masks. Which view's mask
-would tell most beside these is printed, and the scene as seen from there is DIR/next.png, for any segmenter. By clicks,
-objects are corrected in `gsseg view`.
+another file, with the indices in DIR/pick.npz and a picture of the first view. Needs no other masks. Prints which
+view's mask would help most besides these, and draws the scene from there as DIR/next.png, for any segmenter.
+`gsseg view` corrects objects by clicks.
 """
 EXAMPLES = """
   gsseg pick scene.ply --data DATASET --view 0001 --mask chair.png --out chair
@@ -81,7 +81,7 @@ def run(options: argparse.Namespace) -> int:
     tell(f"{len(picked.ids):,} of {len(scene):,} Gaussians: {out}/{file}, pick.npz, and pick.png to look at")
     if unseen:
         lens = "" if following.undistortion is None else ", without its lens: masks are of the photo"
-        tell(f"a mask of view {quoted(following.name)} would tell most: {out}/next.png is the scene from there{lens}")
+        tell(f"a mask of view {quoted(following.name)} would help most: {out}/next.png is the scene from there{lens}")
     return 0
 
 

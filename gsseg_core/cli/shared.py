@@ -36,7 +36,7 @@ def add_scene(parser: argparse.ArgumentParser) -> None:
 
 def add_frame(parser: argparse.ArgumentParser) -> None:
     """Add `--align` and `--dataparser`."""
-    find = "find where the cameras are in the scene, and put them there; see gsseg doctor"
+    find = "find the cameras' place in the scene and move them there; see gsseg doctor"
     parser.add_argument("--align", action="store_true", help=find)
     add_dataparser(parser)
 

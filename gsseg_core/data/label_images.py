@@ -97,8 +97,8 @@ def _read_header(file: BufferedReader, source: str) -> PngHeader:
     header = png_header(file.read(26), source)
     kind, depth, width, height = header
     if kind != "palette" and (kind != "gray" or depth not in (8, 16)):
-        colours = "of ids drawn in colours save the ids themselves (a palette made for each image numbers them anew)"
-        fix = f"; a photo is no mask, and {colours}" if "RGB" in kind else ""
+        colours = "write the ids themselves, not colours (a palette made for each image renumbers them)"
+        fix = f"; a photo is not a mask; {colours}" if "RGB" in kind else ""
         raise MaskFormatError(
             f"{source}: is {kind} of {depth} bits per channel; expected a one-channel 8- or 16-bit PNG of labels{fix}"
         )

@@ -84,7 +84,7 @@ def read_supervises(
         if stem not in known:
             flaw = f"names the view {quoted(stem)}, which has no camera; expected stems, or '*'"
         elif stem in masks and masks[stem].suffix.lower() != ".png":
-            flaw = f"names {masks[stem].name}, which says itself what it supervises; expected label images (.png)"
+            flaw = f"names {masks[stem].name}, which lists its own classes; expected label images (.png)"
         elif not isinstance(ids, list) or not ids or any(type(i) is not int or not 0 <= i <= MAX_LABEL for i in ids):
             flaw = f"{of_stem} {clipped(ids)}; expected a list of ids 0 to {MAX_LABEL}"
         elif class_names is not None and (unknown_ids := [i for i in ids if i not in class_names]):

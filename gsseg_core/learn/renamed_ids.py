@@ -58,7 +58,7 @@ def renamed_note(
         return ""
     pairs = listed((f"{entry['name']} ({entry['others_say']})" for entry in renamed), NOTED, written)
     return (
-        f"other views call {counted(len(renamed), 'id')} by another that no mask shows beside it: {pairs}. Did a "
-        f"tracker lose objects and name them anew, or are there two names for one thing? {per_view} finds objects "
-        f"whatever their ids are, and {label_map} puts names together"
+        f"other views use another id for {counted(len(renamed), 'id')}, and no mask shows both: {pairs}. Did a "
+        f"tracker lose objects and give them new ids, or are there two names for one thing? {per_view} finds objects "
+        f"whatever their ids are, and {label_map} merges names"
     )

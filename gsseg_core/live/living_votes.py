@@ -38,8 +38,8 @@ class LivingVotes(VoteLearner):
         """Add a view and its votes, as `Learner.observe` does; raises `UnknownGroupError`, too."""
         if view.group is not None and view.group not in self.living.frames:
             raise UnknownGroupError(
-                f"view '{view.name}': belongs to group {view.group}, which the scene has not; expected one of its "
-                f"{len(self.living.frames)} groups"
+                f"view '{view.name}': belongs to group {view.group}, which the scene does not have; expected one of "
+                f"its {len(self.living.frames)} groups"
             )
         return super().observe(view, operator)
 

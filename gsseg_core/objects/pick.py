@@ -74,7 +74,7 @@ class Pick:
         return make_operator(scene, camera, device).render(self.membership[:, None])[..., 0] >= 0.5
 
     def next_view(self, scene: GaussianScene, cameras: Sequence[Camera], *, device: str = "cpu") -> int:
-        """Find the camera whose mask would tell most: where the most of what is in doubt is seen, in px.
+        """Find the camera whose mask would help most: where the most of what is in doubt is seen, in px.
 
         In doubt is how far a membership m may be off, its standard deviation sqrt(m (1 - m)), as far as it was guessed
         from neighbours and not seen: s / (s + e), with e the evidence and s the strength of the neighbours. Raises

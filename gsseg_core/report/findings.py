@@ -107,7 +107,7 @@ def frame_of(report: Mapping[str, Any], asked: str = "DATASET --scene SCENE") ->
             drawn = Agreement(**masks)
             what = f"{drawn.misplaced}; {PIXELS}" if drawn.misplaced else "are masks of other views, or turned?"
             if drawn.agrees is False:
-                told.append(f"{drawn.doubt}, but as photos do: {what}")
+                told.append(f"{drawn.doubt}, but like the photos: {what}")
             elif drawn.misplaced:
                 told.append(what)
     return [sentence for sentence in told if sentence]
@@ -120,7 +120,7 @@ def grey_ids_of(report: Mapping[str, Any]) -> str:
     if few < _SHADES or few < len(unnamed) / 2:
         return ""
     return (
-        f"{few} of the {len(unnamed)} ids in the masks got hardly a Gaussian: are these shades of grey, of masks that "
+        f"{few} of the {len(unnamed)} ids in the masks got hardly a Gaussian: are they shades of grey, from masks that "
         "were blurred, or resized other than by nearest pixel? An id is a whole number, 1 and not 255 for one object; "
         "what lies between, a probability, is a soft mask (docs/masks.md)"
     )
@@ -144,7 +144,7 @@ def warnings_of(
     if views["used"] < FEW_VIEWS:
         warnings.append(
             f"Learnt from {counted(views['used'], 'view')} only. With fewer than {FEW_VIEWS}, "
-            "what a mask got wrong cannot be told from what is there."
+            "errors in the masks cannot be detected."
         )
     if views["rejected"]:
         reasons = ", ".join(f"{count} {why}" for why, count in views["rejected"].items())
@@ -165,8 +165,8 @@ def warnings_of(
     empty = {k: names[k] for k, entry in enumerate(report["classes"]) if entry["id"] and not entry["gaussians"]}
     if empty and report.get("ids"):
         warnings.append(
-            f"{len(empty):,} of {counted(report['ids']['objects'], 'object')} that were found got no Gaussian, as "
-            f"other views give what their masks show to others: {listed(empty.values(), NOTED, written)}."
+            f"{len(empty):,} of {counted(report['ids']['objects'], 'object')} that were found got no Gaussian, since "
+            f"other views give what their masks show to other objects: {listed(empty.values(), NOTED, written)}."
         )
     elif empty:
         warnings.append(
@@ -177,13 +177,13 @@ def warnings_of(
         weak = [names[k] for k in np.argsort(ious).tolist() if k in told_of and ious[k] < KNOWN_CLASS]
         if weak:
             warnings.append(
-                f"Of {counted(len(weak), 'class', 'classes')} masks and prediction overlap by less than half "
+                f"In {counted(len(weak), 'class', 'classes')}, masks and prediction overlap by less than half "
                 f"(IoU below {KNOWN_CLASS:g}): {listed(weak, NOTED, written)}."
             )
     total = max(report["scene"]["gaussians"], 1)
     if gaussians["unobserved"] > 0.02 * total:
         warnings.append(
-            f"{100 * gaussians['unobserved'] / total:.0f} % of the Gaussians were seen by no mask and have no "
-            "neighbour that was; they belong to nothing."
+            f"{100 * gaussians['unobserved'] / total:.0f} % of the Gaussians are covered by no mask and have no "
+            "neighbour that is; they have no class."
         )
     return warnings

@@ -212,7 +212,7 @@ class LivingScene:
         """Mark the Gaussians that are not removed, (N,), once all ids of a change are checked."""
         stays, places = np.ones(len(self), bool), self.places(delta.removed)
         if (missing := delta.removed[places < 0]).size:
-            raise SceneDeltaError(f"scene delta: removes {missing.size} ids that the scene has not (first "
+            raise SceneDeltaError(f"scene delta: removes {missing.size} ids that the scene does not have (first "
                                   f"{missing[0]}); expected ids of its {len(self)} Gaussians")  # fmt: skip
         stays[places] = False
         places = self.places(delta.added_ids)

@@ -23,7 +23,7 @@ def read_ids(vertices: npt.NDArray[np.void], source: str) -> npt.NDArray[np.int6
         return None
     halves = vertices[LOW], vertices[HIGH]
     if not all(half.dtype.kind in "iu" and half.min(initial=0) >= 0 for half in halves):
-        raise SceneValueError(f"{source}: {LOW} and {HIGH} are no ids; expected two uint, the halves of each id")
+        raise SceneValueError(f"{source}: {LOW} and {HIGH} are not ids; expected two uint, the halves of each id")
     low, high = (half.astype(np.int64) for half in halves)
     ids: npt.NDArray[np.int64] = (high << 32) | low
     if ids.min(initial=0) < 0 or len(np.unique(ids)) < len(ids):

@@ -116,7 +116,8 @@ class ClientRenderers:
                 renderer.nodes = None
         client.add_notification(
             "The server draws",
-            "This browser draws slowly, as without a GPU, so it gets images. `--draw browser` leaves it to itself.",
+            "This browser draws slowly, as without a GPU, so the server sends it images. "
+            "`--draw browser` prevents that.",
             auto_close_seconds=NOTICE,
         )
 

@@ -99,7 +99,7 @@ class Settings:
         self._check_cameras_and_frames()
         self._check_classes()
         if self.data_root and not Path(self.data_root).is_dir():
-            raise SettingsError(f"parameter data_root: {self.data_root} is no folder; expected one that exists")
+            raise SettingsError(f"parameter data_root: {self.data_root} is not a folder; expected one that exists")
 
     def _check_meaning_of_masks(self) -> None:
         if self.cameras and self.detections_topic.startswith("/"):

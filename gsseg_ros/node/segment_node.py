@@ -192,7 +192,7 @@ class SegmentNode(LifecycleNode):
         """Stop a running job, wait for the requests at work, and stop listening."""
         self.workspace.active = False
         if not self.workspace.slot.cancel(STOP_SECONDS):
-            self.get_logger().warning(f"a job did not stop within {STOP_SECONDS:g} s; going on without it")
+            self.get_logger().warning(f"a job did not stop within {STOP_SECONDS:g} s; continuing without it")
         if not self.workspace.requests.drained(STOP_SECONDS):
             self.get_logger().warning(f"a request did not end within {STOP_SECONDS:g} s; it will publish nothing")
         if self.obstacles is not None:

@@ -102,7 +102,7 @@ class Topic:
             if usual and self._patience_s <= _PATIENCE_S - _USUAL_S:
                 self._say(
                     f"'{self.publisher.topic_name}': a receiver has not taken in what was sent for {_USUAL_S:g} s (is "
-                    f"it busy, or was it killed?); going on without it after {_PATIENCE_S:g} s"
+                    f"it busy, or was it killed?); continuing without it after {_PATIENCE_S:g} s"
                 )
         self._unheard = 0
 

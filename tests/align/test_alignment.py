@@ -321,7 +321,7 @@ def test_doctor_says_what_makes_cameras_fit_and_whether_they_did(
     assert main(["doctor", str(turned), "--scene", str(demo / "scene.ply"), "--quiet"]) == 2
     assert "as in OpenGL" in capsys.readouterr().out
     assert main(["doctor", "--scene", str(demo / "scene.ply")]) == 2
-    assert "expected a dataset, too" in capsys.readouterr().err
+    assert "expected a dataset as well" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize("turned", [False, True])
@@ -333,7 +333,7 @@ def test_masks_that_do_not_belong_to_photos_that_fit_are_said_not_to(
         labels = view.read_labels()
         write_mask(data / f"labels/{view.name}.png", labels[::-1, ::-1] if turned else labels, 8)
     assert main(["segment", str(demo / "scene.ply"), "--data", str(data), *QUICK, str(tmp_path / "out")]) == 0
-    assert ("as the masks do from these cameras, but as photos do" in capsys.readouterr().err) == turned
+    assert ("like the masks from these cameras, but like the photos" in capsys.readouterr().err) == turned
 
 
 SMALL, FAR = "of what cameras look at is nearer to them than 0.01", "the scene is so far from its origin that float32"
@@ -365,7 +365,7 @@ def test_segment_warns_too_where_nobody_can_tell_whether_cameras_fit(
 ) -> None:
     monkeypatch.setattr(placing, "agreement", lambda *_: Agreement("masks", 6, 0.34, 0.28, None))
     assert main(["segment", str(demo / "scene.ply"), "--data", str(demo), *QUICK, str(tmp_path / "out")]) == 0
-    assert "hardly looks as the masks do from these cameras" in capsys.readouterr().err
+    assert "hardly looks like the masks from these cameras" in capsys.readouterr().err
 
 
 @pytest.mark.usefixtures("few_views", "few_axes")
@@ -377,7 +377,7 @@ def test_segment_warns_in_one_line_of_cameras_that_do_not_fit_and_align_mends_it
     scene = str(demo / "scene.ply")
     assert main(["segment", scene, "--data", str(lost), *QUICK, str(tmp_path / "out")]) == 0
     assert capsys.readouterr().err.count("try --align") == 1
-    assert "The scene does not look as the masks do from these cameras" in (tmp_path / "out/report.html").read_text()
+    assert "The scene does not look like the masks from these cameras" in (tmp_path / "out/report.html").read_text()
     assert json.loads((tmp_path / "out/report.json").read_text())["frame"]["agreement"]["agrees"] is False
 
     assert main(["segment", scene, "--data", str(turned), *QUICK, str(tmp_path / "out"), "--align"]) == 0

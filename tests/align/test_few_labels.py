@@ -35,7 +35,7 @@ def test_masks_of_few_labels_never_say_that_cameras_do_not_fit(demo_run: Path, s
     assert found is not None and found.telling == (len(shown) > 3)
     assert found.agrees is (False if found.telling else None)
     if not found.telling:  # Among all conventions, one would agree by chance.
-        with pytest.raises(AlignmentError, match=r"masks of so few labels .* expected photos of the views"):
+        with pytest.raises(AlignmentError, match=r"masks with so few labels .* expected photos of the views"):
             find_alignment(scene, views)
 
 
@@ -53,7 +53,7 @@ def test_a_convention_that_masks_hardly_prefer_is_not_taken(
         patch.object(placing, "find_convention", lambda *_: Convention(inverted=True)),
     ):
         if moved is None:
-            with pytest.raises(AlignmentError, match="no convention of axes has scene and masks agree"):
+            with pytest.raises(AlignmentError, match="no convention of axes makes scene and masks agree"):
                 find_alignment(scene, views)
         else:
             assert bool(find_alignment(scene, views).alignment.parts) == moved
@@ -62,4 +62,4 @@ def test_a_convention_that_masks_hardly_prefer_is_not_taken(
 def test_a_report_does_not_blame_cameras_for_masks_of_few_labels() -> None:
     found = Agreement("masks", 6, 0.21, 0.2, None, telling=False)
     (said,) = frame_of({"scene": {}, "frame": {"agreement": vars(found)}})
-    assert said.startswith("masks of so few labels cannot tell") and "--align" not in said
+    assert said.startswith("masks with so few labels cannot show") and "--align" not in said

@@ -54,8 +54,8 @@ def moved(mask: Image.Image) -> Image.Image:
 
 
 CHANGES: dict[str, tuple[Change, str]] = {
-    "padded": (padded, "if masks are stretched, which undoes that images were padded to squares$"),
-    "cut": (cut, "if masks are squeezed, which undoes that squares were cut out of images$"),
+    "padded": (padded, "if masks are stretched, which undoes padding the images to squares$"),
+    "cut": (cut, "if masks are squeezed, which undoes cutting squares out of the images$"),
     "mirrored": (lambda mask: mask.transpose(Image.Transpose.FLIP_LEFT_RIGHT), "if masks are mirrored$"),
     "upside down": (lambda mask: mask.transpose(Image.Transpose.FLIP_TOP_BOTTOM), "if masks are upside down$"),
     "turned": (lambda mask: mask.transpose(Image.Transpose.ROTATE_180), "if masks are turned by half$"),
@@ -82,7 +82,7 @@ def changed(view: View, change: Change) -> View:
 def test_it_is_said_how_masks_would_lie_on_what_they_show(name: str, data: Dataset, pictures: Pictures) -> None:
     change, said = CHANGES[name]
     told = str(how_they_lie(pictures, look_at([changed(view, change) for view in data.views("train")], SETTINGS)))
-    assert told.startswith("masks do not lie on what they show: outlines agree with edges of the scene by 0.")
+    assert told.startswith("masks do not lie on what they show: their outlines agree with edges of the scene by 0.")
     assert re.search(said, told)
 
 
@@ -146,19 +146,21 @@ def test_commands_say_it_where_photos_agree_with_the_scene(
         write_mask(tmp_path / f"labels/{view.name}.png", changed(view, padded).read_labels(), 8)
     found = place(scene, Dataset(tmp_path), check=True)
     assert found.agreement is not None and found.agreement.agrees and found.agreement.compared == "photos"
-    assert found.masks is not None and "padded to squares" in found.masks.misplaced and not found.fits
+    assert (
+        found.masks is not None and "undoes padding the images to squares" in found.masks.misplaced and not found.fits
+    )
     (told,) = frame_of({"scene": {}, "frame": found.as_dict()})
     assert told == f"{found.masks.misplaced}; expected masks in the pixels of the images"
     of_old = {key: value for key, value in vars(found.masks).items() if key != "misplaced"}
     assert replace(found.masks, misplaced="") == Agreement(**of_old), "reports of earlier versions are read"
     segment = ["segment", str(demo_run / "scene/scene.ply"), "--data", str(tmp_path), "--quiet"]
     assert main([*segment, "--out", str(tmp_path / "out")]) == 0
-    assert "padded to squares; expected masks in the pixels of the images" in capsys.readouterr().err
+    assert "padding the images to squares; expected masks in the pixels of the images" in capsys.readouterr().err
     report = json.loads((tmp_path / "out/report.json").read_text())
-    assert "padded to squares" in report["frame"]["masks"]["misplaced"]
-    assert "padded to squares" in (tmp_path / "out/report.html").read_text()
+    assert "padding the images to squares" in report["frame"]["masks"]["misplaced"]
+    assert "padding the images to squares" in (tmp_path / "out/report.html").read_text()
     unused, cause, *effects = warnings_of(report, None)
-    assert "18 no mask" in unused and "padded to squares" in cause, "the cause comes first"
+    assert "18 no mask" in unused and "padding the images to squares" in cause, "the cause comes first"
     assert any("with the other views" in effect for effect in effects)
     assert main(["doctor", str(tmp_path), "--scene", str(demo_run / "scene/scene.ply"), "--quiet"]) == 2
-    assert "padded to squares" in capsys.readouterr().out
+    assert "padding the images to squares" in capsys.readouterr().out

@@ -223,8 +223,8 @@ def test_masks_of_which_ids_are_shades_of_grey_are_said_to_be(place: Path, capsy
         white = Image.fromarray(np.where(np.array(Image.open(path)) == 1, 255, 0).astype(np.uint8))
         white.filter(ImageFilter.GaussianBlur(2)).save(path)
     assert main(segment(place)) == 0
-    assert "are these shades of grey, of masks that were blurred" in capsys.readouterr().err
-    assert "are these shades of grey" in (place / "out/report.html").read_text()
+    assert "are they shades of grey, from masks that were blurred" in capsys.readouterr().err
+    assert "are they shades of grey" in (place / "out/report.html").read_text()
 
 
 def test_a_scene_too_far_from_its_origin_for_float32_is_said_to_be(

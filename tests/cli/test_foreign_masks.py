@@ -108,7 +108,7 @@ def test_a_folder_of_unknown_files_is_refused_with_what_is_read(
     for view in range(6):
         (place / f"data/strange/view{view}{suffix}").write_text(content)
     assert main([*segment(place), "--labels", "strange"]) == 2
-    said = f"strange/view0{suffix}: is no file of masks that is known; gsseg reads label"
+    said = f"strange/view0{suffix}: is not a file of masks in a known format; gsseg reads label"
     assert_one_line(capsys.readouterr().err, said)
 
 

@@ -179,7 +179,7 @@ def test_an_empty_path_is_not_taken_for_the_folder_where_the_command_is_typed(
     before = contents(place)
     for option in ("out", "data"):
         assert main([*command(place, kind), f"--{option}", ""]) == 2
-        assert_one_line(capsys.readouterr().err, f"{option} is ''; expected something")
+        assert_one_line(capsys.readouterr().err, f"{option} is ''; expected a value")
     assert main(["remove", "s.ply", "--segmentation", "s.npz", "--class", "", "--out", "x.ply"]) == 2
     assert_one_line(capsys.readouterr().err, "classes is ''")
     assert contents(place) == before

@@ -168,7 +168,7 @@ def test_json_that_is_nested_without_end_is_refused(tmp_path: Path, opened: str)
         ('<mask label="a" rle="4.5,4.5" left="0" top="0" width="3" height="3"/>', "'rle' is '4.5'; expected a whole"),
         ('<mask label="a" rle="5" left="0" top="0" width="99999999" height="99999999"/>', "limit max_pixels"),
         ('<mask label="a" rle="5" left="0" top="0" height="9"/>', "'width' is ''; expected a whole number"),
-        ('<box label="a" xtl="0" ytl="0" xbr="3" ybr="3"/>', "has a box, which is no outline"),
+        ('<box label="a" xtl="0" ytl="0" xbr="3" ybr="3"/>', "has a box, which is not an outline"),
         ("<polygon", "not valid XML"),
         ("</image>", "not valid XML"),
     ],
@@ -270,7 +270,7 @@ def test_names_of_yolo_that_are_wrong_are_refused(tmp_path: Path, content: str) 
         ("../x,9", "has a mask '../x' of '9' pixels"),
         ("-1,9", "has a mask '-1'"),
         ("5,9", "5.png: cannot be read"),
-        ("9" * 2**18, "metadata.csv: is no CSV"),
+        ("9" * 2**18, "metadata.csv: is not CSV"),
     ],
 )
 def test_a_list_of_automatic_masks_that_names_others_is_refused(tmp_path: Path, row: str, said: str) -> None:

@@ -102,7 +102,7 @@ def test_cameras_that_nerfstudio_does_not_train_from_stay_and_a_file_named_for_t
     write_json(tmp_path / "dataparser_transforms.json", dataparser())
     dataset = Dataset(tmp_path)
     assert place(one_gaussian(), dataset).dataset.cameras[0].center == pytest.approx(dataset.cameras[0].center)
-    with pytest.raises(CameraFileError, match="says nothing of the cameras"):
+    with pytest.raises(CameraFileError, match="does not describe the cameras"):
         place(one_gaussian(), dataset, dataparser=tmp_path / "dataparser_transforms.json")
     with pytest.raises(CameraFileError, match=r"no\.json: does not exist; expected nerfstudio's dataparser_transforms"):
         place(one_gaussian(), dataset, dataparser=tmp_path / "no.json")

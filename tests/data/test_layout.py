@@ -249,7 +249,7 @@ def test_files_of_masks_that_are_not_read_are_refused_with_whose_they_are_and_wh
     data: Path, capsys: pytest.CaptureFixture[str], content: object, told: str
 ) -> None:
     (data / "project.json").write_text(json.dumps(content))
-    assert f"no file of masks that is known, {told}" in error_of(capsys, data, "--labels", "project.json")
+    assert f"not a file of masks in a known format, {told}" in error_of(capsys, data, "--labels", "project.json")
 
 
 def test_masks_of_sam_as_pixels_are_refused_with_what_to_have_it_write(

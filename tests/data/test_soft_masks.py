@@ -306,7 +306,7 @@ def test_supervises_json_tells_what_label_images_say_something_of(tmp_path: Path
         ('{"view1": []}', "expected a list of ids"),
         ('{"view1": [true]}', "expected a list of ids"),
         ('{"*": [9]}', "has the class 9; expected ids of classes.json"),
-        ('{"view0": [1]}', "names view0.npz, which says itself"),
+        ('{"view0": [1]}', "names view0.npz, which lists its own classes"),
     ],
 )
 def test_broken_supervises_json_gets_one_clear_error(tmp_path: Path, content: str, message: str) -> None:

@@ -93,8 +93,8 @@ def test_the_command_says_which_ids_name_one_object_and_finds_objects_whatever_t
     command = ["segment", f"{data}/scene.ply", "--data", str(data), "--quiet", "--out", f"{tmp_path}/out"]
     assert main(command) == 0
     said = capsys.readouterr().err
-    assert said.count("\n") == 1 and "by another that no mask shows beside it: class_" in said and "--ids per" in said
+    assert said.count("\n") == 1 and "and no mask shows both: class_" in said and "--ids per" in said
     report = json.loads((tmp_path / "out/report.json").read_text())
-    assert report["views"]["renamed"] and "by another that no mask shows" in (tmp_path / "out/report.html").read_text()
+    assert report["views"]["renamed"] and ", and no mask shows both" in (tmp_path / "out/report.html").read_text()
     assert main([*command, "--ids", "per-view"]) == 0 and capsys.readouterr().err == ""
     assert "renamed" not in json.loads((tmp_path / "out/report.json").read_text())["views"]

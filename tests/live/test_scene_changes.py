@@ -155,7 +155,7 @@ def test_votes_of_views_that_are_not_kept_any_more_go_along_with_their_gaussians
     [
         (SceneDelta(revision=5), "its revision is 5; expected 2, as the scene is at 1"),
         (SceneDelta(revision=1), "its revision is 1; expected 2"),
-        (SceneDelta(removed=np.array([626])), "removes 1 ids that the scene has not .first 626."),
+        (SceneDelta(removed=np.array([626])), "removes 1 ids that the scene does not have .first 626."),
         (replace(other_room((0, 0, 9)), added_ids=np.arange(626)), "adds 626 ids that the scene has already .first 0."),
         (SceneDelta(moves=(GroupMove(9, FAR),)), "moves group 9, which holds no Gaussian"),
     ],
@@ -222,7 +222,7 @@ def test_a_mask_counts_as_it_was_fused_whatever_becomes_of_its_file(tmp_path: Pa
 
 def test_a_view_of_a_group_that_the_scene_has_not_is_refused() -> None:
     rejection = LivingSession(SCENE, NAMES).fuse(replace(VIEWS[0], group=7))
-    assert rejection is not None and "belongs to group 7, which the scene has not" in rejection.message
+    assert rejection is not None and "belongs to group 7, which the scene does not have" in rejection.message
 
 
 def test_a_group_that_is_moved_back_is_where_it_was_for_new_views() -> None:

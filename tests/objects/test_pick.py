@@ -184,7 +184,7 @@ def test_the_command_writes_a_ply_and_the_ids(tmp_path: Path, capsys: pytest.Cap
     assert header.pop("run") and header == {"format": "gsseg-pick-1", "scene": scene.digest}
     np.testing.assert_array_equal(GaussianScene.load(tmp_path / "mask/object.ply").means, scene.means[ids])
     assert (tmp_path / "mask/pick.png").is_file()
-    told = re.search(r"a mask of view '(view\d)' would tell most", capsys.readouterr().out)
+    told = re.search(r"a mask of view '(view\d)' would help most", capsys.readouterr().out)
     assert told and (tmp_path / "mask/next.png").is_file()
     again = told[1]
     assert main([*start, *by_mask[:4], "--view", again, "--mask", str(data / f"labels/{again}.png"), *by_mask[4:]]) == 0

@@ -114,11 +114,12 @@ DOUBTFUL = [{"name": "v7", "reliability": 0.5}, {"name": "v8", "reliability": No
         (
             {"classes": [CUP, BOX], "ids": {"objects": 2}},
             0.9,
-            "1 of 2 objects that were found got no Gaussian, as other views give what their masks show to others: cup",
+            "1 of 2 objects that were found got no Gaussian, since other views give what their masks show to other "
+            "objects: cup",
         ),
         ({"classes": []}, 0.9, "No Gaussian is part of an object"),
         ({}, 0.3, "overlap by less than half (IoU below 0.5): cup"),
-        ({"gaussians": {"unobserved": 40}}, 0.9, "40 % of the Gaussians were seen by no mask"),
+        ({"gaussians": {"unobserved": 40}}, 0.9, "40 % of the Gaussians are covered by no mask"),
     ],
 )
 def test_each_fault_gets_its_warning(changes: dict[str, object], iou: float, said: str) -> None:

@@ -63,7 +63,7 @@ def test_names_that_are_read_from_the_right_leave_warnings_in_order(out: Path) -
     page = report_page(PageInputs(report, SCENE, result, MaskChecks([], {}, False), ViewImages(SCENE)))
     shown = "\u05db\u05d9\u05e1\u05d0 \\u2069&lt;/bdi&gt;"
     assert f"of its pixels: <bdi>{shown}</bdi>. Wrong ids" in page
-    assert f"no mask shows beside it: <bdi>{shown} (cup)</bdi>. Did" in page
+    assert f"and no mask shows both: <bdi>{shown} (cup)</bdi>. Did" in page
 
 
 def test_page_asks_for_nothing_from_elsewhere_and_may_not(outline: Outline, out: Path, text: str) -> None:

@@ -56,7 +56,7 @@ def test_what_was_found_holds_until_the_views_are_forgotten_or_others_are_learnt
     session, frames = LivingSession(balls_on_a_table()[0], NAMES), FrameCheck()
     fed(session, tilted(clean_views()))
     said = frames.look(session, session.scene, session.learn())
-    assert said.startswith("the scene does not look as the masks do from these cameras (agreement with 5 masks 0.")
+    assert said.startswith("the scene does not look like the masks from these cameras (agreement with 5 masks 0.")
     assert "optical frame" in said and "scene_to_map" in said
     assert frames.problem(session) == said
     fed(session, clean_views())  # Under the same names: the others are gone.
@@ -84,6 +84,6 @@ def test_the_log_and_diagnostics_say_so(ros: Ros, tmp_path: Path) -> None:
     robot.fuse(tilted(clean_views()))
     robot.learn()
     robot.wait_for_status(lambda status: "optical frame" in status["message"], "the doubt")
-    assert "the scene does not look as the masks do from these cameras" in node.output
+    assert "the scene does not look like the masks from these cameras" in node.output
     robot.done("reset")
     robot.wait_for_status(lambda status: status["message"] == "fusing", "no doubt")

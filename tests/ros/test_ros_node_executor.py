@@ -80,7 +80,7 @@ def test_a_message_for_which_there_is_too_little_memory_is_lost_and_its_callback
     publish_until(lambda: len(heard) == 3, "both messages of the second round")
     executor.shutdown()
     assert group.can_execute(subscription) and group.can_execute(beside)
-    assert len(said) == 1 and said[0].startswith("/mask: what has come cannot be taken in, and is lost: ")
+    assert len(said) == 1 and said[0].startswith("/mask: what was received cannot be processed, and is lost: ")
 
 
 def test_topics_of_classes_which_may_be_hundreds_are_nothing_that_the_executor_looks_at(node: SegmentNode) -> None:

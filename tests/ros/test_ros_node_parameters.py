@@ -132,7 +132,7 @@ def test_a_parameter_that_does_not_exist_cannot_be_set(robot: Robot) -> None:
         ({"max_views": 2.5}, "max_views"),
         ({"pose_source": "gps"}, "parameter pose_source is 'gps'; expected topic, odometry, tf"),
         ({"scene_to_map.rotation": [0.0, 0.0, 0.0, 0.0]}, "scene_to_map.rotation is all zeros"),
-        ({"data_root": "/no/such/folder"}, "parameter data_root: /no/such/folder is no folder"),
+        ({"data_root": "/no/such/folder"}, "parameter data_root: /no/such/folder is not a folder"),
     ],
 )
 def test_a_bad_parameter_at_the_start_is_one_error_and_exit_code_two(
@@ -275,7 +275,7 @@ def test_parameters_that_the_node_does_not_have_are_named_with_those_that_were_m
     process = ros.start("segment_node", {"autostart": False, "max_view": 10, "controller.rate": 5.0, "k": 44})
     process.wait_for("autostart is false")
     assert (
-        "[gsseg]: parameters that this node does not have are passed over: controller.rate, max_view (did you mean "
+        "[gsseg]: parameters that this node does not have are ignored: controller.rate, max_view (did you mean "
         "max_views?)\n" in process.output
     )
 

@@ -180,7 +180,7 @@ def test_a_quality_of_service_of_no_topic_is_named_with_the_one_that_was_meant(
     process = robot.start(parameters | given, lossless=False)
     robot.wait_active()
     assert (
-        "parameters that this node does not have are passed over: qos_overrides./maks.subscription.reliability (did "
+        "parameters that this node does not have are ignored: qos_overrides./maks.subscription.reliability (did "
         "you mean qos_overrides./mask.subscription.reliability?)\n" in process.output
     )
 

@@ -213,7 +213,7 @@ def test_without_a_subscriber_it_warns_and_goes_on(ros: Ros, folder: Path) -> No
 
 def test_a_parameter_that_it_does_not_have_is_named(ros: Ros, folder: Path) -> None:
     process = ros.start("replay_node", {"data": folder, "rate": 1000.0, "wait_for_subscriber": 0.0, "split": "test"})
-    process.wait_for("are passed over: wait_for_subscriber (did you mean wait_for_subscribers?)")
+    process.wait_for("are ignored: wait_for_subscriber (did you mean wait_for_subscribers?)")
 
 
 def test_it_waits_for_a_subscriber_that_comes_late(ros: Ros, folder: Path) -> None:

@@ -154,7 +154,7 @@ def test_a_file_changes_the_scene_and_a_grown_one_takes_votes_along(
 @pytest.mark.parametrize(
     ("fields", "code", "message"),
     [
-        ({"delta": SceneDeltaMessage(removed=[9999])}, 3, "removes 1 ids that the scene has not"),
+        ({"delta": SceneDeltaMessage(removed=[9999])}, 3, "removes 1 ids that the scene does not have"),
         ({"delta": SceneDeltaMessage(removed=[2**63])}, 3, "expected numbers of at most"),
         ({"delta": SceneDeltaMessage(added_ids=[9999], means=[0.0])}, 3, "means are 1 numbers; expected 3"),
         ({"path": "none.npz"}, 11, "does not exist"),

@@ -176,9 +176,9 @@ def test_ids_that_a_tracker_gave_anew_are_said_once_in_the_log_and_in_diagnostic
         learn(here, "em")
         (line,) = lines
         assert verdict() == line
-        assert line.startswith("other views call ") and "by another that no mask shows beside it: class_" in line
+        assert line.startswith("other views use another id for ") and "and no mask shows both: class_" in line
         assert line.endswith("The parameter ids set to per-view finds objects whatever their ids are, and label_map "
-                             "puts names together")  # fmt: skip
+                             "merges names")  # fmt: skip
         here.node.trigger_deactivate()
         here.node.trigger_activate()
         assert verdict() == line

@@ -31,7 +31,7 @@ def test_a_message_that_cannot_be_taken_in_is_lost_and_all_who_wait_go_on(
         def is_said() -> bool:
             nonlocal said
             said += capfd.readouterr().err
-            return "/cloud: what has come cannot be taken in, and is lost: " in said
+            return "/cloud: what was received cannot be processed, and is lost: " in said
 
         ros.wait_until(is_said, "the loss")
         subscription.msg_type = kind

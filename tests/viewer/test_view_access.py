@@ -131,7 +131,7 @@ def test_a_port_that_is_none_is_refused(port: int) -> None:
         ),
         ("no such host", "host 'no such host' is not known; expected a name or an address of this machine"),
         ("a" * 80 + ".example", "is not known; expected"),
-        ("", "host is ''; expected something"),
+        ("", "host is ''; expected a value"),
     ],
 )
 def test_an_address_that_is_not_this_machines_gives_one_clear_error_before_anything_long_runs(

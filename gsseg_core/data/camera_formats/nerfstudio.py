@@ -71,7 +71,7 @@ def _size_of_image(entry: Entry, folder: Path, within: Path | None) -> tuple[int
         with open_image(image, IntrinsicsError, "image", "a photo", within=within) as photo:
             return photo.size
     except IntrinsicsError as error:
-        expected = "'w' and 'h', here or for all frames, or an image that tells"
+        expected = "'w' and 'h', here or for all frames, or an image to take it from"
         raise IntrinsicsError(f"{entry.where}: the image size is missing; expected {expected}: {error}") from None
 
 

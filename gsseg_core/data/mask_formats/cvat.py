@@ -62,7 +62,7 @@ def _check_outlines(shapes: ElementTree.Element, where: str) -> None:
     """Raise `MaskFormatError` if an element holds shapes that are no outline in one image."""
     if refused := next((shape.tag for shape in shapes if shape.tag in _REFUSED), None):
         raise MaskFormatError(
-            f"{where}: has a {refused}, which is no outline in one image; "
+            f"{where}: has a {refused}, which is not an outline in one image; "
             "expected polygons and masks, exported as CVAT for images 1.1"
         )
 

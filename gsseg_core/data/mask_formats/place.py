@@ -175,4 +175,4 @@ class Place:
         try:
             return self.read(path).decode("utf-8-sig")
         except UnicodeDecodeError as cause:
-            raise MaskFormatError(f"{path}: is no text in UTF-8 ({cause.reason}); expected text") from cause
+            raise MaskFormatError(f"{path}: is not UTF-8 text ({cause.reason}); expected text") from cause

@@ -156,7 +156,7 @@ def _listed_in(place: Place, folder: Path) -> list[tuple[int, Path]]:
     try:
         rows = list(csv.DictReader(place.text(folder / METADATA).splitlines()))
     except csv.Error as cause:
-        raise MaskFormatError(f"{folder / METADATA}: is no CSV ({cause}); expected a row for each mask") from cause
+        raise MaskFormatError(f"{folder / METADATA}: is not CSV ({cause}); expected a row for each mask") from cause
     masks: list[tuple[float, int, Path]] = []
     for row in rows:
         number, area = str(row.get("id")), str(row.get("area"))

@@ -130,7 +130,9 @@ def open_masks(place: Place) -> MaskSet | None:
             )
         if not found and (unknown := _unknown(place)):
             hint = _foreign_hint(place.sample[1])
-            raise MaskFormatError(f"{unknown}: is no file of masks that is known{hint}; gsseg reads {known_formats()}")
+            raise MaskFormatError(
+                f"{unknown}: is not a file of masks in a known format{hint}; gsseg reads {known_formats()}"
+            )
         masks = found[0].read(place) if found else None
     except RecursionError as cause:
         raise MaskFormatError(f"{path}: is nested too deep; expected masks") from cause
