@@ -14,10 +14,10 @@ COMMANDS = {
     "segment": "learn from masks, refine, write labels and one PLY per object",
     "render": "render label maps and overlays of a segmentation",
     "eval": "score label maps: mIoU, mAcc, boundary IoU",
-    "pick": "pick one object by its masks in a view or a few, and write it as a PLY",
-    "view": "look at a scene in the browser, class by class, and correct labels",
+    "pick": "pick one object by its mask in one or a few views, and write it as a PLY",
+    "view": "view a scene in the browser, class by class, and correct labels",
     "remove": "write the scene without some of its objects",
-    "merge": "add up what several robots have learnt of one scene",
+    "merge": "merge what several robots have learnt about one scene",
     "demo": "make a small scene with known truth and segment it",
     "doctor": "show what this machine has, what it lacks, and how to install that",
     "completion": "print a script for tab completion",
@@ -91,7 +91,8 @@ def build_parser(full: Collection[str] = COMMANDS.keys()) -> argparse.ArgumentPa
         command = commands.add_parser(name, help=line, formatter_class=argparse.RawDescriptionHelpFormatter)
         if name in full:
             module = command_module(name)
-            command.description = textwrap.fill(" ".join(module.DESCRIPTION.split()), 78)
+            paragraphs = module.DESCRIPTION.split("\n\n")
+            command.description = "\n\n".join(textwrap.fill(" ".join(text.split()), 78) for text in paragraphs)
             command.epilog = f"examples:\n{module.EXAMPLES.strip(chr(10))}"
             module.add_arguments(command)
             command.set_defaults(run=module.run)

@@ -10,8 +10,8 @@ from gsseg_core.errors import SettingsError
 SHELLS = ("bash", "zsh", "fish")
 
 DESCRIPTION = """
-Prints a script that completes commands, options, their choices, files and folders. It is made from the same
-description as this help, so make it again after an update.
+Prints a script that completes commands, options, their choices, files and folders. Print it again after an update of
+gsseg.
 """
 EXAMPLES = """
   bash: gsseg completion bash > ~/.local/share/bash-completion/completions/gsseg

@@ -9,8 +9,8 @@ from gsseg_core.cli.terminal import tell
 from gsseg_core.progress import progress_bars
 
 DESCRIPTION = """
-Makes a table with eight objects as Gaussians, posed views, and masks that are wrong as real ones are; segments it,
-and scores the result against the truth. Needs no data.
+Makes a scene (a table with eight objects), posed views, and masks with realistic errors; segments the scene, and
+scores the result against the truth. Needs no data.
 """
 EXAMPLES = """
   gsseg demo
@@ -21,7 +21,8 @@ EXAMPLES = """
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare what the command takes."""
     parser.add_argument("--out", default="demo_out", metavar="DIR", help="folder to write to (default: %(default)s)")
-    parser.add_argument("--seed", type=int, default=0, help="of the scene and its masks' errors (default: %(default)s)")
+    seed = "seed of the scene and of its masks' errors (default: %(default)s)"
+    parser.add_argument("--seed", type=int, default=0, help=seed)
     add_quiet(parser)
 
 

@@ -35,13 +35,14 @@ from gsseg_core.errors import CameraFileError, GssegError, SettingsError
 from gsseg_core.kernels import kernel_cache
 
 DESCRIPTION = """
-Prints the versions of gsseg, Python and its packages, the devices, whether the kernels run and where they are cached,
-the formats that are read, which extras are installed, and what there is of ROS 2. For all that is missing it says what
-to type. The exit code is 0 if gsseg works, with or without extras, and 2 if not.
+Without PATH: prints the versions of gsseg, Python and its packages, the devices, whether the kernels run and where
+they are cached, the formats that gsseg reads, the installed extras, and the parts of ROS 2, with the command that
+installs each missing one. The exit code is 0 if gsseg works, with or without extras, and 2 if not.
 
-Of a scene it prints its format instead, and what this format keeps of a Gaussian. Of a dataset it reads cameras and
-masks, and prints what is there. With --scene it prints whether the cameras fit the scene (exit code 0), and if not
-(2), which axes, scale, rotation and translation make them fit; and whether masks lie on what photos show.
+With a scene: prints its format, and what this format keeps of a Gaussian. With a dataset: reads its cameras and masks,
+and prints what it holds. With a dataset and --scene: prints whether the cameras fit the scene (exit code 0) or else
+which axes, scale, rotation and translation make them fit (exit code 2), and whether the masks lie on what the photos
+show.
 """
 EXAMPLES = """
   gsseg doctor
@@ -84,10 +85,10 @@ class Finding:
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare what the command takes."""
-    what = "a scene, to print its format; or a dataset, to read it, and with --scene to see whether its cameras fit"
+    what = "a scene, or a dataset (with --scene: do its cameras fit that scene?)"
     parser.add_argument("path", nargs="?", metavar="PATH", help=what)
-    parser.add_argument("--scene", metavar="SCENE", help="trained scene that cameras of the dataset PATH should fit")
-    labels = "the masks, as for gsseg segment; without photos, --scene goes by them alone (default: labels)"
+    parser.add_argument("--scene", metavar="SCENE", help="trained scene that cameras of the dataset should fit")
+    labels = "the masks, as for gsseg segment; --scene uses them where there are no photos (default: labels)"
     parser.add_argument("--labels", default=LABELS, metavar="PATH", help=labels)
     add_dataparser(parser)
     add_device(parser)

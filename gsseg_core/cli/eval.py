@@ -10,9 +10,9 @@ from pathlib import Path
 from gsseg_core.cli.terminal import note, tell
 
 DESCRIPTION = """
-Scores predicted label maps against true ones of the same names: IoU, accuracy and boundary IoU of each class, and
-their means over the classes that occur. Pixels whose truth is unknown do not count. Where the cameras beside the truth
-have lenses that bend, the truth is undistorted first, as rendered label maps are those of pinhole views.
+Scores predicted label maps against true ones with the same names: IoU, accuracy and boundary IoU of each class, and
+their means over the classes that occur. Pixels whose truth is unknown do not count. If the cameras beside the truth
+have lens distortion, the truth is undistorted first, because rendered label maps are pinhole views.
 """
 EXAMPLES = """
   gsseg eval --pred rendered --truth DATASET/labels
@@ -23,9 +23,9 @@ EXAMPLES = """
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare what the command takes."""
     parser.add_argument("--pred", required=True, metavar="DIR", help="folder of predicted label maps <stem>.png")
-    truth = "folder of true label maps <stem>.png, or true masks of another program, as COCO"
+    truth = "folder of true label maps <stem>.png, or true masks of another program, such as COCO"
     parser.add_argument("--truth", required=True, metavar="PATH", help=truth)
-    parser.add_argument("--json", metavar="FILE", help="write the scores there, too")
+    parser.add_argument("--json", metavar="FILE", help="also write the scores to this file")
 
 
 def run(options: argparse.Namespace) -> int:

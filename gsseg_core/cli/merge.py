@@ -8,10 +8,10 @@ from gsseg_core.cli.shared import check_not_read
 from gsseg_core.cli.terminal import tell
 
 DESCRIPTION = """
-Adds up saved states of one scene, as robots save them with ~/save_state: votes are added exactly, as if all masks had
-come to one robot, and views of the same name are told apart. A view that two states hold counts twice, as its votes
-cannot be told without the scene: ~/merge_states counts it once. Learnt codes are those of one state's views, and are
-left out: load the result and learn again.
+Adds up saved states of one scene, which robots save with ~/save_state. Votes are added exactly, as if one robot had
+received all masks; views with the same name stay separate. A view that is in two states counts twice, because its votes
+cannot be found without the scene; ~/merge_states counts it once. Learnt class probabilities are left out, since each
+state learnt them from its own views only: load the result and learn again.
 """
 EXAMPLES = """
   gsseg merge first_robot.npz second_robot.npz -o both.npz
@@ -20,7 +20,7 @@ EXAMPLES = """
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare what the command takes."""
-    parser.add_argument("states", metavar="STATE", nargs="+", help="saved state of the scene that all states share")
+    parser.add_argument("states", metavar="STATE", nargs="+", help="saved state; all must be of the same scene")
     parser.add_argument("-o", "--out", required=True, metavar="FILE", help="state to write")
 
 

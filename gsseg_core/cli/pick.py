@@ -23,10 +23,10 @@ if TYPE_CHECKING:
 CANDIDATES = 24  # cameras of which the next view is chosen, spread over all, as neighbours see much the same
 
 DESCRIPTION = """
-Finds the Gaussians of one object that is shown by a mask of one view, or of a few, and writes it as DIR/object.ply, or
-another file, with the indices in DIR/pick.npz and a picture of the first view. Needs no other masks. Prints which
-view's mask would help most besides these, and draws the scene from there as DIR/next.png, for any segmenter.
-`gsseg view` corrects objects by clicks.
+Finds the Gaussians of one object from its mask in one view, or in a few, and writes it as DIR/object.ply, or another
+file, with the indices in DIR/pick.npz and a picture of the first view. Needs no other masks. Prints which further
+view's mask would help most, and draws the scene from there as DIR/next.png, for any segmenter. To correct an object by
+clicks, use `gsseg view`.
 """
 EXAMPLES = """
   gsseg pick scene.ply --data DATASET --view 0001 --mask chair.png --out chair
@@ -40,13 +40,15 @@ EXAMPLES = """
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare what the command takes."""
     add_scene(parser)
-    view = "the view in which it is shown; several, each with its --mask, add up"
+    view = "a view that shows the object; may be given several times, each with its --mask"
     parser.add_argument("--view", required=True, action="append", metavar="STEM", dest="views", help=view)
-    mask = "label image of the view, or masks of another program, as COCO: all that is not 0 is the object"
+    mask = "label image of the view, or masks of another program, such as COCO: every pixel that is not 0 is the object"
     parser.add_argument("--mask", required=True, action="append", metavar="PATH", dest="masks", help=mask)
-    label = "the object is this label alone: an id, or the name of a class"
+    label = "only this label is the object: an id, or the name of a class"
     parser.add_argument("--label", help=label)
-    parser.add_argument("--out", required=True, metavar="DIR", help="gets object.ply, pick.npz, pick.png and next.png")
+    parser.add_argument(
+        "--out", required=True, metavar="DIR", help="folder for object.ply, pick.npz, pick.png, next.png"
+    )
     add_format(parser.add_argument, DEFAULT)
     add_collision(parser.add_argument, "the object, as object.obj and in USD")
 

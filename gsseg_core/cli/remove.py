@@ -9,8 +9,8 @@ from gsseg_core.cli.terminal import tell
 from gsseg_core.progress import progress_bars
 
 DESCRIPTION = """
-Writes a valid 3DGS PLY, or a file of another format, of all Gaussians but those of the given classes. What an object
-hid, no camera has seen: where it stood there may be holes, and nothing is made up to fill them.
+Writes all Gaussians except those of the given classes as a valid 3DGS PLY, or a file of another format. No camera saw
+what the removed object hid: there may be holes where it stood, and gsseg does not fill them.
 """
 EXAMPLES = """
   gsseg remove scene.ply --segmentation out/segmentation.npz --class chair \\
@@ -24,11 +24,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare what the command takes."""
     parser.add_argument("scene", metavar="SCENE", help="trained 3DGS scene, of any format that gsseg reads")
     parser.add_argument("--segmentation", required=True, metavar="FILE", help="segmentation.npz of this scene")
-    classes = "id or name of a class, part or whole to leave out, a number being an id; may be given several times"
+    classes = "id or name of a class, part or whole to remove (a number is an id); may be given several times"
     parser.add_argument("--class", dest="classes", action="append", required=True, metavar="NAME", help=classes)
     parser.add_argument("--out", required=True, metavar="FILE", help="file to write")
-    add_format(parser.add_argument, None, "what the suffix of FILE says, else ply")
-    add_collision(parser.add_argument, "each object that is left, as .obj beside FILE, or in a USD")
+    add_format(parser.add_argument, None, "by the suffix of FILE, else ply")
+    add_collision(parser.add_argument, "each remaining object, as .obj beside FILE, or in a USD")
     add_quiet(parser)
 
 

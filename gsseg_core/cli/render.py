@@ -10,8 +10,8 @@ from gsseg_core.progress import progress_bars
 from gsseg_core.text import counted
 
 DESCRIPTION = """
-Renders the label map of each view of a split as DIR/<stem>.png, of 16 bits where 8 cannot hold the ids, and pictures
-of it in DIR/overlays. No masks are needed.
+Renders the label map of each view of a split as DIR/<stem>.png (16 bits if 8 cannot hold the ids), and overlays on the
+scene in DIR/overlays. Needs no masks.
 """
 EXAMPLES = """
   gsseg render scene.ply --data DATASET --segmentation out/segmentation.npz \\

@@ -24,8 +24,8 @@ from gsseg_core.refine.settings import RefineSettings
 from gsseg_core.scene.scene_writers import DEFAULT as DEFAULT_FORMAT
 
 DESCRIPTION = """
-Learns from the masks of the train views which Gaussian belongs to which class, refines that by the neighbours in
-space, and writes OUT/segmentation.npz, one PLY (or another file) per class, a report and pictures.
+Learns from the masks of the train views which Gaussian belongs to which class, refines the result in space, and writes
+OUT/segmentation.npz, one PLY (or another file) per class, a report and pictures.
 """
 EXAMPLES = """
   gsseg segment scene.ply --data DATASET --out out
@@ -41,21 +41,21 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare what the command takes."""
     add_scene(parser)
     parser.add_argument("--out", required=True, metavar="OUT", help="folder to write to")
-    labels = "the masks: a folder in DATASET, or a file or folder of another program, as COCO (default: labels)"
+    labels = "the masks: a folder in DATASET, or a file or folder of another program, such as COCO (default: labels)"
     parser.add_argument("--labels", default=LABELS, metavar="PATH", help=labels)
-    renames = "JSON that renames, merges and ignores classes of the masks, as in docs/formats.md"
+    renames = "JSON file that renames, merges or ignores classes of the masks; see docs/formats.md"
     parser.add_argument("--label-map", metavar="FILE", help=renames)
-    ids = "an id means the same in every view, or holds in its own view only (default: as the format of the masks says)"
+    ids = "whether an id names the same object in every view, or in its own view only (default: by the masks' format)"
     parser.add_argument("--ids", choices=("global", "per-view"), help=ids)
-    level = "per-view ids: the level to write, 0 (objects put together) to 1 (all their parts) (default: the objects)"
+    level = "per-view ids: the level to write, from 0 (groups of objects) to 1 (all parts) (default: the objects)"
     parser.add_argument("--granularity", type=float, metavar="G", help=level)
     add = parser.add_argument_group("learning").add_argument
     add("--learner", choices=tuple(LEARNERS), default=DEFAULT, help="default: %(default)s")
     add("--views", type=int, metavar="N", help="learn from N train views, spread evenly (default: all)")
     pixels = "learn from all pixels, or from every second or fourth of each row and column, for speed (default: full)"
     add("--quality", choices=("full", "half", "quarter"), default="full", help=pixels)
-    add("--seed", type=int, default=0, help="for learners that draw at random (default: %(default)s)")
-    budget = "memory for prepared views; more of them go to a temporary file (default: an eighth of what is free)"
+    add("--seed", type=int, default=0, help="for learners that use random numbers (default: %(default)s)")
+    budget = "memory for prepared views; the rest goes to a temporary file (default: an eighth of the free memory)"
     add("--memory-budget", type=int, metavar="MIB", help=budget)
     learners = " and ".join(distributed_learners())
     add("--scheduler", metavar="ADDRESS", help=f"learn on the workers of this Dask scheduler ({learners})")
@@ -69,9 +69,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     ways = "after KNN: cut objects to their silhouettes in the views, or filter outliers (default: %(default)s)"
     add("--refine", choices=("carve", "paper"), default="carve", help=ways)
     for name, effect in {
-        "--no-graph": "few views: leave what they hardly saw to KNN, without label propagation",
-        "--no-knn": "leave uncertain and unobserved Gaussians as they are",
-        "--no-filter": "neither cut objects nor filter them",
+        "--no-graph": "with few views: no label propagation to Gaussians that they hardly saw; KNN decides",
+        "--no-knn": "no KNN: leave uncertain and unobserved Gaussians as they are",
+        "--no-filter": "neither cut objects to silhouettes nor filter outliers",
     }.items():
         add(name, action="store_true", help=effect)
     # The default today, which once had to be asked for.

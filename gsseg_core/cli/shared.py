@@ -64,7 +64,7 @@ def add_format(add: Callable[..., object], default: str | None, otherwise: str =
 
 def add_collision(add: Callable[..., object], what: str) -> None:
     """Add `--collision` by the `add_argument` of a parser or group; `what` says of what, and where they are written."""
-    mesh = f"a mesh to collide with of {what}: convex, or watertight, or a Poisson surface (default: none, or hull)"
+    mesh = f"collision mesh of {what}: convex hull, watertight, or Poisson surface (default: none, or hull)"
     add("--collision", nargs="?", choices=("hull", "surface", "poisson"), const="hull", help=mesh)
 
 

@@ -24,8 +24,8 @@ if TYPE_CHECKING:
     from gsseg_core.viewer.viewer import Viewer
 
 DESCRIPTION = """
-Serves a page in which the scene is drawn in true colours, by class or by confidence; classes can be shown alone,
-corrected and exported. With --ros it follows a node while that learns.
+Serves a page that draws the scene in true colours, by class or by confidence. There you can show single classes,
+correct them and export them. With --ros the page follows a ROS 2 node while it learns.
 """
 EXAMPLES = """
   gsseg view scene.ply --segmentation out/segmentation.npz --data DATASET
@@ -37,15 +37,15 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare what the command takes."""
     parser.add_argument("scene", metavar="SCENE", help="trained 3DGS scene, of any format that gsseg reads")
     parser.add_argument("--segmentation", metavar="FILE", help="segmentation.npz of this scene")
-    data = "folder of the views that it was learnt from, for jumping to them"
+    data = "dataset that the segmentation was learnt from, to jump to its views"
     parser.add_argument("--data", metavar="DATASET", help=data)
     parser.add_argument("--ros", action="store_true", help="follow the ROS 2 node `gsseg` while it learns")
-    host = "0.0.0.0 lets others look who have the token of the address (default: %(default)s)"
+    host = "0.0.0.0 admits other machines that have the address with its token (default: %(default)s)"
     parser.add_argument("--host", default="127.0.0.1", help=host)
     parser.add_argument("--port", type=int, default=8080, help="default: %(default)s, or the next one that is free")
-    draw = "who draws: the browser; the server, which sends it images; or (default) the browser if it is fast"
+    draw = "where to draw: in the browser; on the server, which sends images; or (default) in the browser if it is fast"
     parser.add_argument("--draw", choices=("auto", "browser", "server"), default="auto", help=draw)
-    parser.add_argument("--open", action="store_true", help="open the page, too")
+    parser.add_argument("--open", action="store_true", help="open the page in a browser")
     add_frame(parser)
     add_device(parser)
     add_quiet(parser)
