@@ -1,1 +1,1 @@
-"""From views to class probabilities: what all learners share, and each of them."""
+"""Learns class probabilities from views: the base class of all learners, and each learner."""

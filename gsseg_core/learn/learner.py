@@ -1,4 +1,4 @@
-"""Learner, the base class of all learners: views are added and taken back one at a time, their votes kept exactly."""
+"""Learner, the base class of all learners: it adds and retracts views one at a time and keeps their votes exactly."""
 
 from __future__ import annotations
 
@@ -41,14 +41,14 @@ R = TypeVar("R")
 
 
 def _checked_num_classes(num_classes: int) -> int:
-    """Return it as Python's own, or raise `SettingsError`: products of NumPy's short ones overflow."""
+    """Return the number of classes as a Python int, since NumPy's short integers overflow; else `SettingsError`."""
     if not isinstance(num_classes, int | np.integer) or not 1 <= num_classes <= MAX_LABEL + 1:
         raise SettingsError(f"num_classes is {num_classes}; expected a whole number from 1 to {MAX_LABEL + 1}")
     return int(num_classes)
 
 
 class Learner(ABC):
-    """Base class of learners, which find the class of each Gaussian of a scene; `fit` sets what ends with "_".
+    """Base class of learners, which find the class of each Gaussian; `fit` sets the attributes that end with "_".
 
     Parameters
     ----------
@@ -57,39 +57,39 @@ class Learner(ABC):
     num_classes : int
         K; labels are 0 (background) to K - 1.
     device : str
-        Where views are rendered.
+        Device that renders the views.
     memory_budget : int, optional
-        Bytes of prepared views to keep between steps; by default an eighth of the free memory, or half of a GPU's.
-        Those beyond it are kept in a temporary file, or prepared anew each time where that has no space, on a GPU, and
-        with 0. What is learnt does not depend on it.
+        Bytes of prepared views to keep in memory between steps; default: 1/8 of the free memory, or half of a GPU's.
+        Further views go to a temporary file. Without space for it, on a GPU, or with a budget of 0, they are prepared
+        again for each step. The result does not depend on the budget.
 
     Attributes
     ----------
     views : dict of str to View
-        Views that count, by name, in the order in which they came; with their masks as they were then, in memory.
+        Views in use, by name, in the order in which they were added. Each keeps its mask of that time in memory.
     rejected : dict of str to str
-        Names of views that could not be used, and why.
+        Reason for rejection of each view that could not be used, by name.
     code_rows_ : CSRRows
-        After `fit`: class probabilities of each Gaussian, the paper's object codes, float32; a row without entries
-        where no pixel of a label that was used saw it, or all that is known is what it is not, see docs/masks.md.
+        After `fit`: class probabilities of each Gaussian (the paper's object codes), float32. A row is empty if no
+        pixel with a used label saw the Gaussian, or if masks only exclude classes for it; see docs/masks.md.
     codes_ : (N, K) float32
-        The same with its zeros, written out each time that it is asked for.
+        The same as a dense array, which is made on each access.
     observed_ : (N,) bool
         After `fit`: whether the Gaussian has a code.
     history_ : list of float
-        The objective of `fit`, step by step, for learners that have one.
+        Objective of `fit` at each step, for learners that have one.
     converged_ : bool
         After `fit`: whether another step would have changed little.
     leaves_out : bool
-        Whether `predict_without` leaves the view's mask out; else the prediction has learnt from it, too.
+        Whether `predict_without` excludes the view's own mask; if not, its prediction was also learnt from that mask.
     checks_masks : bool
-        Whether a report holds every mask against `predict_without`.
+        Whether a report compares every mask with `predict_without`.
     """
 
     code_rows_: CSRRows
     observed_: np.ndarray
     converged_: bool = False
-    dropped: tuple[bytes, ...] = ()  # `View.digest` of views whose votes stay; replaced and never changed
+    dropped: tuple[bytes, ...] = ()  # `View.digest` of dropped views whose votes stay; never changed in place
     leaves_out = False
     checks_masks = False
 
@@ -105,31 +105,31 @@ class Learner(ABC):
         self.rejected: dict[str, str] = {}
         self._unfit()
         self._votes = VoteTotal(len(scene), num_classes, along_curve(scene))
-        self._prepared = PreparedViews(memory_budget, with_file=device == "cpu")  # what lies on a GPU is not for a file
+        self._prepared = PreparedViews(memory_budget, with_file=device == "cpu")  # GPU data is not written to files
         self._turned = False
 
     @classmethod
     def default_settings(cls, max_steps: int | None, seed: int) -> tuple[Any, ...]:
-        """Arguments after `num_classes` for `gsseg_core.learn.registry.make_learner`: settings, where there are any.
+        """Return the arguments after `num_classes` for `gsseg_core.learn.registry.make_learner`: settings, if any.
 
-        `max_steps` is for learners that take steps, None for their own default; `seed` for those that draw at random.
+        Iterative learners use `max_steps` (None: their own default). Learners that draw at random use `seed`.
         """
         return ()
 
     def observe(self, view: View, operator: ViewOperator | None = None) -> bool:
-        """Add a view and its votes. A view of a name that is there already replaces it.
+        """Add a view and its votes. It replaces an earlier view of the same name.
 
-        The view's `operator` is made here unless it is at hand.
+        The view's `operator` is made here unless the caller passes it.
 
         Returns
         -------
         bool
-            Whether the view can be used; if not, `rejected` says why, and nothing has changed.
+            Whether the view can be used; if not, `rejected` has the reason, and nothing else changes.
 
         Raises
         ------
         MaskFormatError, MaskSizeError, UnknownLabelError
-            The mask is broken, of another size than the camera, or has labels beyond the classes.
+            The mask is broken, its size differs from the camera's, or it has labels beyond the classes.
         """
         if self.memory_budget == 0 and view.name not in self.views:
             view = view.held()
@@ -141,8 +141,8 @@ class Learner(ABC):
         return self._add(*self._opened(view, operator))
 
     def observe_all(self, views: Sequence[View], progress: Progress = silent) -> None:
-        """Add views, as `observe` does; the error that one of them raises ends it."""
-        if self.memory_budget == 0:  # Each view votes as it is lifted.
+        """Add views as `observe` does, up to the first that raises an error."""
+        if self.memory_budget == 0:  # Nothing prepared is kept, so each view adds its votes while it is lifted.
             for view in with_progress(progress, "observe", views):
                 self.observe(view)
             return
@@ -151,12 +151,12 @@ class Learner(ABC):
                 self._add(view, opened, total)
 
     def retract(self, name: str) -> None:
-        """Take a view's votes back, exactly.
+        """Remove a view and subtract its votes exactly.
 
         Raises
         ------
         SettingsError
-            There is no such view.
+            There is no view of this name.
         """
         view, observation = self._observed(name), self._prepared.get(name)
         if observation is not None:
@@ -166,15 +166,15 @@ class Learner(ABC):
         self.forget(name)
 
     def forget(self, name: str) -> None:
-        """Drop a view and its mask; its votes stay. `fit` learns from the views that are left. Raises as `retract`."""
+        """Drop a view and its mask but keep its votes. `fit` learns from the views that remain. Raises as `retract`."""
         self._observed(name)
         del self.views[name]
         self._prepared.drop(name)
 
     def resize(self, num_classes: int) -> None:
-        """Have this many classes, more than any label of `views` (`SettingsError`).
+        """Change the number of classes; `SettingsError` unless it is larger than every label of `views`.
 
-        Votes for others are gone, and so is what `fit` has learnt of them.
+        With fewer classes than before, votes for the removed ones and the results of `fit` are dropped.
         """
         num_classes = _checked_num_classes(num_classes)
         shrinks = num_classes < self.num_classes
@@ -187,22 +187,22 @@ class Learner(ABC):
             self.num_classes = num_classes
 
     def most_classes(self, vote_bytes: int) -> int:
-        """How many classes there can be while votes, as they are now, take so many bytes; those there are at least."""
+        """Return how many classes fit if the current votes may take `vote_bytes`; at least the current number."""
         return self._votes.most_classes(vote_bytes)
 
     @property
     def codes_(self) -> np.ndarray:
-        """Class probabilities with their zeros, (N, K) float32, after `fit`."""
+        """Class probabilities as a dense array, (N, K) float32, after `fit`."""
         return self.code_rows_.dense(self.num_classes)
 
     @property
     def loss(self) -> float:
-        """What `fit` minimises, as of its last step, in nats per labelled pixel; NaN where there is no such thing."""
+        """Loss that `fit` minimises, at its last step, in nats per labelled pixel; NaN for learners without one."""
         return float("nan")
 
     @abstractmethod
     def fit(self: Self, progress: Progress = silent) -> Self:
-        """Learn `code_rows_` from the views observed so far; one that takes steps is decorated by `fits_whole`.
+        """Learn `code_rows_` from the views observed so far; an iterative `fit` is decorated by `fits_whole`.
 
         Raises
         ------
@@ -211,36 +211,37 @@ class Learner(ABC):
         """
 
     def predict_without(self, view: View) -> np.ndarray:
-        """Blend into a view the probabilities learnt without its mask, as far as `leaves_out`: (H, W, K) float32.
+        """Render class probabilities learnt without the view's own mask, if `leaves_out`: (H, W, K) float32.
 
-        After `fit`, for one of its views; what `leaves_out` its mask raises `SettingsError` for others. Nothing of the
-        learner changes. Rows sum to less where little is known.
+        Call it after `fit`, for a view that `fit` used; a learner that `leaves_out` raises `SettingsError` for others.
+        The learner does not change. The K values of a pixel sum to less than 1 where little is known.
         """
         if not hasattr(self, "code_rows_"):
             raise SettingsError(f"view {view.name!r} was not learnt from; expected it after fit()")
         return self._blend_codes(self.code_rows_, view)
 
     def strongest_without(self, view: View, wanted: np.ndarray | None = None, grid: PixelGrid = NO_PIXELS) -> Strongest:
-        """Tell the class of each pixel of a view by `predict_without`, and the probabilities of the pixels of a grid.
+        """Return the class of each pixel by `predict_without`, and the probabilities at the pixels of a grid.
 
-        Little is known where most of a ray ends on Gaussians that only this view has seen. If only some pixels with a
-        label are `wanted`, (H, W) bool, others may have any class and probabilities, and it takes less time.
+        Little is known where most of a ray ends on Gaussians that only this view has seen. To save time, pass the
+        labelled pixels that are `wanted`, (H, W) bool: the others may then have any class and probabilities.
         """
         return Strongest.of(self.predict_without(view), grid)
 
     def rejected_share(self, view: View) -> float:
-        """Share of a view's labelled pixels whose label `fit` has not used, in [0, 1]."""
+        """Return the share of a view's labelled pixels whose label `fit` rejected, in [0, 1]."""
         return 0.0
 
     def state(self) -> State:
-        """Return a copy of votes and views, to be saved."""
+        """Return a copy of the votes and views for saving."""
         views = list(self.views.values())
         return State(self._votes.rows(), self.num_classes, views, len(views), dropped=self.dropped)
 
     def adopt(self, state: State) -> None:
-        """Replace views, votes and number of classes by a state's, of the same scene; votes of old are cast anew.
+        """Replace views, votes and number of classes by those of a state of the same scene.
 
-        What `fit` has learnt of other views is gone. Raises `StateMismatchError` where its scene has another size.
+        Drops the results of `fit`, and lifts masks again that an older version lifted along whole rays. Raises
+        `StateMismatchError` if the state's number of Gaussians is not the scene's.
         """
         if (found := state.votes.num_rows) != len(self.scene):
             raise StateMismatchError(f"state is of {found} Gaussians; expected {len(self.scene)}, as the scene has")
@@ -254,22 +255,21 @@ class Learner(ABC):
             self._votes = votes_cast_anew(state, self._operator_of, self._used_labels, votes.order)
 
     def vote_codes(self) -> np.ndarray:
-        """Votes as probabilities, (N, K) float32; a row of zeros where no labelled pixel saw the Gaussian."""
+        """Return the votes as probabilities, (N, K) float32; a row is zero if no labelled pixel saw the Gaussian."""
         return self.vote_rows().dense(self.num_classes)
 
     def vote_rows(self) -> CSRRows:
-        """Votes as probabilities, as `vote_codes`; rows of float32, without entries where those have zeros only."""
+        """Return the votes as probabilities in float32 CSR rows; a row is empty where that of `vote_codes` is zero."""
         return vote_shares(self._votes.rows(), self._possible())
 
     def vote_rows_without(self, name: str) -> CSRRows:
-        """Votes of all other views as probabilities, as `vote_rows` has those of all."""
+        """Return the votes of all views but one as probabilities, in the form of `vote_rows`."""
         others = self._votes.copy()
         self.observation(name).vote(others, sign=-1)
         return vote_shares(others.rows(), self._possible())
 
     def evidence(self) -> np.ndarray:
-        """Weight of the labelled pixels that saw each Gaussian, over all views, in px, (N,) float32."""
-        # Votes against a class are evidence as much as votes for one.
+        """Weight of the labelled pixels that saw each Gaussian, over all views and for or against, px, (N,) float32."""
         return np.asarray(weigh_votes(self._votes.rows())[0] * VOTE_UNIT, np.float32)
 
     def reject_summary(self) -> dict[str, int]:
@@ -277,7 +277,7 @@ class Learner(ABC):
         return dict(Counter(self.rejected.values()))
 
     def observation(self, name: str) -> Observation:
-        """Return a view with its mask, prepared; it is kept, in memory as far as the budget goes."""
+        """Return a view with its mask in prepared form, and keep it, in memory if the budget allows."""
         observation = self._prepared.get(name)
         if observation is None:
             view = self._observed(name)
@@ -286,17 +286,17 @@ class Learner(ABC):
         return observation
 
     def prepared_bytes(self) -> tuple[int, int]:
-        """Tell how many bytes of prepared views are kept, in memory and in the temporary file."""
+        """Return the bytes of prepared views that are kept in memory and in the temporary file."""
         return self._prepared.nbytes
 
     def _unfit(self) -> None:
-        """Drop what `fit` has set, when the views or classes that it is of are gone."""
+        """Drop the results of `fit`, after its views or classes were removed."""
         for name in [name for name in vars(self) if name.endswith("_")]:
             delattr(self, name)
         self.history_: list[float] = []
 
     def _observed(self, name: str) -> View:
-        """Return a view by name; raise `SettingsError` where there is none."""
+        """Return a view by name; raise `SettingsError` if there is none."""
         if name not in self.views:
             raise SettingsError(f"view {name!r} was not observed; there are {len(self.views)} others")
         return self.views[name]
@@ -304,15 +304,15 @@ class Learner(ABC):
     def _lift(
         self, view: View, sign: int, operator: ViewOperator | None = None, seen: SeenLabels | None = None
     ) -> bool:
-        """Add a view's votes, or take them away, and keep nothing of it; tell whether it sees any Gaussian."""
+        """Add or subtract a view's votes without keeping the view; return whether it sees any Gaussian."""
         operator = operator or self._operator_of(view)
         used = self._used_labels(seen or read_mask(view, self.num_classes), operator)
         return operator.vote(used.labels, used.evidence, self._votes, sign=sign)
 
     def _opened(self, view: View, operator: ViewOperator | None = None) -> tuple[View, Observation | UnusableViewError]:
-        """Prepare a new view; return the error that says why, where it cannot be used. First comes the view, held.
+        """Prepare a new view; return it with its mask in memory, and its observation or the error that rejects it.
 
-        Should the file of its mask change, nothing else tells which votes were its own: to save, or to prepare it anew.
+        The mask is held because its file may change, and only this mask can later subtract or restore the same votes.
         """
         view = view.held()
         try:
@@ -322,12 +322,12 @@ class Learner(ABC):
         return view, observation if observation.num_pairs else UnusableViewError(SEES_NOTHING)
 
     def _add(self, view: View, opened: Observation | UnusableViewError | None, total: Any = None) -> bool:
-        """List a view, and add its votes, if it is prepared, to the `total` or else to the learner's; or reject it."""
+        """Register a view and add its votes, if prepared, to `total` (None: the learner's votes); or reject it."""
         if isinstance(opened, UnusableViewError):
             self.rejected[view.name] = str(opened)
             return False
         undo: list[Undo] = []
-        if opened is not None:  # First: where there is no memory for its votes, the view in whose place it comes stays.
+        if opened is not None:  # Votes first: if they don't fit into memory, the view that it replaces stays.
             vote = partial(opened.vote, self._votes if total is None else total)
             vote()
             undo.append(partial(vote, sign=-1))
@@ -343,10 +343,10 @@ class Learner(ABC):
     def _of_each(
         self, work: Callable[[str, Observation], R], names: Iterable[str], tick: Callable[[], None]
     ) -> Iterator[tuple[str, R]]:
-        """Give the names of some prepared views, and what `work` makes of each; `tick` is called before each.
+        """Yield the name of each view and the result of `work` on it in prepared form; call `tick` before each.
 
-        Several views are worked on at once. Every second time the last view comes first: of a file that is larger than
-        the memory that caches it, what was read last is still there.
+        Several views are processed at once. Every second call goes backwards, because a file cache that is smaller than
+        the temporary file still holds the views that were read last.
         """
         names, self._turned = list(names), not self._turned
         names = names if self._turned else names[::-1]
@@ -367,21 +367,21 @@ class Learner(ABC):
         return operator.observe(*self._used_labels(seen, operator))
 
     def _used_labels(self, seen: SeenLabels, operator: ViewOperator) -> SeenLabels:
-        """Turn a mask into the labels that are learnt from; here, as they are."""
+        """Turn a mask into the labels to learn from; the base class returns them unchanged."""
         return seen
 
     def _require_views(self) -> None:
-        """Raise `NoUsableViewsError` where there is no view to learn from."""
+        """Raise `NoUsableViewsError` if there is no view to learn from."""
         if not self.views:
             reasons = [f"{why}: {counted(count, 'view')}" for why, count in self.reject_summary().items()]
             why = ", ".join(reasons) or "none was given"
             raise NoUsableViewsError(f"no view to learn from ({why}); expected posed views with label images")
 
     def _finish(self) -> None:
-        """Clear codes without evidence, and impute those of Gaussians with votes only against classes."""
+        """Clear codes without evidence; impute those of Gaussians that only have votes against classes."""
         votes = self._votes.rows()
         against = weigh_votes(votes)[1] < 0
-        # A Gaussian with votes for a class that is not `observed_` was seen in rejected regions only: it stays unknown.
+        # With votes for a class but not `observed_`, a Gaussian was seen in rejected regions only: it stays unknown.
         self.code_rows_ = self.code_rows_.only(self.observed_ | against)
         unsure = np.flatnonzero(against & ~self.observed_)
         if len(unsure):
@@ -393,7 +393,7 @@ class Learner(ABC):
         return self._operator_of(view).blend_probabilities(codes, self.num_classes, background)
 
     def _possible(self) -> np.ndarray:
-        """Mark the ids that are classes, (K,) bool: those that views name; all, where one of them has no names."""
+        """Mark the ids that are classes, (K,) bool: those that views name, or all if a view has no class names."""
         names = {id(view.class_names): view.class_names for view in self.views.values()}.values()
         if not names or None in names:
             return np.ones(self.num_classes, bool)

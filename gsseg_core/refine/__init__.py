@@ -1,1 +1,1 @@
-"""Learnt probabilities made better by what lies near in space."""
+"""Refines learnt class probabilities with those of nearby Gaussians."""

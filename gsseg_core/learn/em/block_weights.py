@@ -1,8 +1,8 @@
-"""Block weights: which blocks of a mask, 4 x 4 pixels each, the steps of EM go through, and how much they count.
+"""Block weights: which blocks of 4 x 4 mask pixels EM uses in its steps, and with what weight.
 
-Where an object ends is told by the pixels near the boundaries of its regions. Far inside, neighbouring pixels say the
-same of the same object, and most views that see a Gaussian at all see it there. So every block near a boundary is gone
-through, and of the others few, in most views other ones. docs/memory.md has what that saves and costs.
+Pixels near region boundaries determine where an object ends. Far inside a region, neighbouring pixels carry the same
+information, and most views of a Gaussian see it there. EM therefore uses every block near a boundary and a sample of
+the others, which differs between most views. docs/memory.md has the savings and the costs.
 """
 
 from __future__ import annotations
@@ -15,18 +15,18 @@ from gsseg_core.kernels.compiler import kernel
 from gsseg_core.raster.constants import BLOCK
 
 NEAR = 1  # blocks around one with a boundary in it
-STEP = 2  # in rows and columns, from one block to the next of those farther away
-FAR = 4.0  # weight of these, each for the four that it stands for
+STEP = 2  # in rows and columns, from one sampled block to the next far from boundaries
+FAR = 4.0  # weight of a sampled block, which represents four
 
 
 def block_weights(
-    labels: np.ndarray,  # (H, W) int32: the mask as it is learnt from, its boundaries aligned
-    mask: np.ndarray,  # (H, W) int32: the mask as it came
+    labels: np.ndarray,  # (H, W) int32: the mask to learn from, with aligned boundaries
+    mask: np.ndarray,  # (H, W) int32: the original mask
 ) -> np.ndarray:
-    """Weigh the blocks of a view's mask, (ceil(H / 4), ceil(W / 4)) float32; those of weight 0 are left out.
+    """Return the weight of each block of a view's mask, (ceil(H / 4), ceil(W / 4)) float32; EM skips weight 0.
 
-    Which of those far from boundaries are gone through follows from where the mask had its boundaries, not from names
-    of views or classes: the same masks teach the same, whoever sends them.
+    The boundaries of the original mask select the sample far from boundaries. Names of views or classes have no
+    influence, so the same masks always give the same result.
     """
     near = near_boundaries(labels, NEAR)
     first, some = crc32(near_boundaries(mask, 0).tobytes()) % STEP**2, np.zeros(near.shape, np.float32)
@@ -36,9 +36,9 @@ def block_weights(
 
 @kernel
 def near_boundaries(labels: np.ndarray, distance: int) -> np.ndarray:
-    """Mark blocks with a boundary of a mask (H, W), and so many around them: (ceil(H / 4), ceil(W / 4)) bool.
+    """Mark blocks within `distance` blocks of a boundary of a mask (H, W): (ceil(H / 4), ceil(W / 4)) bool.
 
-    A boundary is met by pixels whose label is not that of a pixel beside, above or below them.
+    A pixel is at a boundary if a horizontal or vertical neighbour has another label.
     """
     height, width = labels.shape
     blocks = np.zeros((-(-height // BLOCK), -(-width // BLOCK)), np.bool_)

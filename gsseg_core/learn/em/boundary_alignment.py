@@ -1,24 +1,28 @@
-"""Boundary alignment: boundaries of a mask are moved to where the scene itself has edges of colour or depth.
+"""Boundary alignment: moves boundaries of a mask to where the scene itself has edges of colour or depth.
 
-The model: each region A of a mask, connected pixels of one label, was drawn s_A px too wide all around, s_A a whole
-number from -S to S. Where two regions touch, their boundary then lies s_A - s_B px too far inside B. With f_AB(b) the
-mean strength of the scene's edges (`gsseg_core.learn.em.scene_edges`) over the pixels on both sides of the boundary of
-A and B, moved b px into A, and n_AB how many these are at b = 0, the log of the posterior of all shifts of a view is,
-but for a constant,
+The model: each region A of a mask (connected pixels of one label) was drawn s_A px too wide all around, where s_A is an
+integer from -S to S. The boundary of two touching regions then lies s_A - s_B px too far inside B. f_AB(b) is the mean
+strength of the scene's edges (`gsseg_core.learn.em.scene_edges`) over the pixels on both sides of the boundary of A and
+B after moving it b px into A; n_AB is the number of these pixels at b = 0. Up to a constant, the log posterior of all
+shifts of a view is
 
     sum_AB SHARPNESS sqrt(n_AB / LENGTH) f_AB(s_A - s_B) + sum_A log p(s_A).
 
-The posterior is approximated by one factor per region (mean field), each in turn set to its optimum given the others.
-The prior p is the view's own and symmetric, re-estimated in every round: in a mask with true boundaries most shifts are
-found to be 0, so p favours 0, and the rest stays, too, unless the edges are clear.
+A mean field approximates the posterior by one factor per region, and sets each in turn to its optimum given the others.
+Each view has its own prior p, which is symmetric and re-estimated in every round. If most boundaries are true, most
+shifts are found to be 0. Then p favours 0, and the other boundaries also stay unless the edges are clear.
 
-Three hypotheses on a mask are compared by the evidence for each, its log-likelihood: that it is right, exact; that
-regions were drawn too wide or too narrow, by the bound that the mean field maximises, sum_q log-posterior + entropy of
-q; and that the mask as a whole lies beside its image (`gsseg_core.learn.em.mask_offset`), with regions right or not.
-The first stands unless another is clearly likelier, shifts of many regions the more clearly, since a little that each
-of them gains, by soft edges beside it, is much in sum. So true masks stay as they are, and a mask whose pose is off is
-moved as a whole, and not bent to edges that are not its own. Where edges are no stronger along the boundaries than
-elsewhere, as on a wall of posters, nothing is moved. docs/method.md has the reasons.
+The evidence (log-likelihood) decides between three hypotheses about a mask:
+
+- The mask is right. Its evidence is exact.
+- Regions were drawn too wide or too narrow. The evidence is the bound that the mean field maximises,
+  sum_q log-posterior + entropy of q.
+- The whole mask is offset from its image (`gsseg_core.learn.em.mask_offset`), with regions right or not.
+
+The first one wins unless another is clearly likelier. Shifts of many regions need a larger margin, because small gains
+from soft edges next to each region add up. So true masks stay unchanged, and a mask with a wrong pose moves as a whole
+instead of being bent to edges of other objects. Nothing moves if edges are no stronger along the boundaries than
+elsewhere, as on a wall of posters. docs/method.md has the reasons.
 """
 
 from __future__ import annotations
@@ -35,45 +39,45 @@ from gsseg_core.learn.em.rejected_regions import connected_pixels
 from gsseg_core.learn.em.scene_edges import sampled
 
 SHARPNESS = 3.0
-"""Log-likelihood of edges of one unit in the mean, in nats, where `LENGTH` pixels lie along the boundary."""
+"""Log-likelihood, in nats, of a boundary of `LENGTH` pixels along edges of mean strength 1."""
 
-LENGTH = 30.0  # in px, of both sides
+LENGTH = 30.0  # in px, both sides together
 
 LONGEST = 400
-"""More pixels than these weigh no more: that a region is too wide by the same all around holds only roughly."""
+"""Number of pixels beyond which a boundary gains no weight: the width error is only roughly equal all around."""
 
-SHORTEST = 3  # boundaries of fewer px on either side are not moved
+SHORTEST = 3  # boundaries with fewer px on either side are not moved
 
 VANISHED = -20.0
-"""Log-likelihood, in nats, of a boundary so far inside a region that hardly anything of it would be left."""
+"""Log-likelihood, in nats, of a boundary moved so far into a region that hardly any of the region would be left."""
 
 TELLING = 1.75
 """Nothing is moved unless edges within S px of the boundaries are this many times as strong as in the whole view."""
 
-CLEAR = 4.0  # nats by which another hypothesis must be likelier than that nothing has to be moved
+CLEAR = 4.0  # margin in nats by which another hypothesis must be likelier than an unmoved mask
 
 EACH_CLEAR, ALL_CLEAR = 1.0, 20.0
-"""Nats by which shifts of regions must be likelier than that: so many more for each boundary moved, so many at most.
+"""For shifts of regions: nats added to that margin for each moved boundary, and the largest total margin.
 
-Errors of masks differ from view to view, and even out over many. Edges that are soft, as of leaves, lie beside the
-objects in all views alike: what is moved to them is a little nearer to the truth in each view, and worse over all.
+Errors of masks differ between views and average out. Soft edges, as of leaves, lie next to the objects in all views
+alike. Boundaries moved to them are slightly nearer to the truth in each view, but the learnt result is worse.
 """
 
-BAND = 64  # rows of the image that are gone through at once
+BAND = 64  # image rows per parallel task
 ROUNDS = 6  # of the mean field, each with a better prior
 
 
 def reach(farthest: int) -> int:
-    """How far from boundaries `align_boundaries` looks at edges, in px to each side."""
+    """Return how far from boundaries `align_boundaries` reads edges, in px to each side."""
     return 2 * farthest + FARTHEST
 
 
 def align_boundaries(
     labels: np.ndarray,  # (H, W) int32: the mask; negative where unknown
-    edges: np.ndarray,  # (H, W) float32: by `scene_edges`, as far as `reach` from boundaries and in the sample
-    farthest: int,  # S, in px: regions are drawn too wide or too narrow by this much at most
+    edges: np.ndarray,  # (H, W) float32: from `scene_edges`, valid within `reach` of boundaries and in the sample
+    farthest: int,  # S, in px: the most by which a region may be too wide or too narrow
 ) -> np.ndarray:
-    """Align a mask and its boundaries with edges of the scene; where it was moved away from a side, it is unknown."""
+    """Align a mask and its boundaries with edges of the scene; pixels that a moved mask does not cover are unknown."""
     here = _align_regions(labels, edges, farthest)
     offset = likeliest_offset(here.beside, here.weights, edges)
     if offset == (0, 0):
@@ -83,24 +87,24 @@ def align_boundaries(
 
 
 class _Alignment(NamedTuple):
-    """A mask with its boundaries aligned, where as a whole it stays in its place."""
+    """A mask with aligned boundaries, without an offset of the whole mask."""
 
     labels: np.ndarray  # (H, W) int32
     evidence: float  # log-likelihood of the edges, in nats
     tells: bool  # whether edges are stronger along the boundaries than elsewhere
-    beside: np.ndarray  # (P,) int64, pixels along the boundaries as they were, counted row by row
-    weights: np.ndarray  # (P,) what edges of one unit are worth in each of them, in nats
+    beside: np.ndarray  # (P,) int64: pixels along the original boundaries, as flat indices (row-major)
+    weights: np.ndarray  # (P,) log-likelihood of an edge of strength 1 at each of these pixels, in nats
 
 
 def _align_regions(labels: np.ndarray, edges: np.ndarray, farthest: int) -> _Alignment:
-    """Align the boundaries of a mask that as a whole stays in its place; `align_boundaries` says what is what."""
-    most = 2 * farthest - 1  # px that a boundary can be moved to either side
+    """Align the boundaries of a mask without moving the whole mask; parameters are those of `align_boundaries`."""
+    most = 2 * farthest - 1  # most px that a boundary can move to either side
     region, first, area = connected_pixels(labels)
     other, ring = _nearest_regions(region, most + 1)
     pairs, pair, lengths, strengths = _boundary_strengths(region, other, ring, edges, len(area), most + 1)
     moving = lengths[:, most : most + 2].min(axis=1) >= SHORTEST
     along = np.maximum(lengths[:, most] + lengths[:, most + 1], 1)  # px of both sides
-    weights = SHARPNESS * np.sqrt(np.minimum(along, LONGEST) / LENGTH)  # nats that edges of one unit are worth
+    weights = SHARPNESS * np.sqrt(np.minimum(along, LONGEST) / LENGTH)  # nats for edges of strength 1
     log_likelihood = _edge_log_likelihood(lengths[moving], strengths[moving], weights[moving])
     beside = np.flatnonzero((ring.ravel() == 1) & np.append(moving, False)[pair])
     still = float(log_likelihood[:, most].sum())
@@ -117,16 +121,16 @@ def _align_regions(labels: np.ndarray, edges: np.ndarray, farthest: int) -> _Ali
 
 
 def _shifts(touching: np.ndarray, log_likelihood: np.ndarray, count: int, farthest: int) -> tuple[np.ndarray, float]:
-    """Find by how much each region was drawn too wide, (R,) int64, in px; `_mean_field_round` has the shapes.
+    """Find by how many px each region was drawn too wide, (R,) int64; `_mean_field_round` has the shapes.
 
-    Returns the evidence for it, too, in nats: the bound of the log-likelihood that the mean field maximises.
+    Also returns the evidence for it in nats: the lower bound of the log-likelihood that the mean field maximises.
     """
     prior = np.full(2 * farthest + 1, 0.25 / farthest)
     prior[farthest] = 0.5
     posterior, touches = np.tile(prior, (count, 1)), np.zeros(count, bool)
     touches[touching] = True
     begin = starts(np.bincount(touching.ravel(), minlength=count))
-    # Pair i ends in its two regions, as 2 i and as 2 i + 1; these are the ends, region by region.
+    # Pair i has two ends, one in each of its regions: 2 i and 2 i + 1. Here the ends are sorted by region.
     ends = np.argsort(touching.ravel(), kind="stable")
     for _ in range(ROUNDS):
         _mean_field_round(touching, log_likelihood, begin, ends, np.log(prior), posterior)
@@ -143,9 +147,9 @@ def _shifts(touching: np.ndarray, log_likelihood: np.ndarray, count: int, farthe
 
 
 def _edge_log_likelihood(lengths: np.ndarray, strengths: np.ndarray, weights: np.ndarray) -> np.ndarray:
-    """Log-likelihood of boundaries moved by -(2 S - 1) to 2 S - 1 px, (P, 4 S - 1), in nats.
+    """Return the log-likelihood of each boundary moved by -(2 S - 1) to 2 S - 1 px, (P, 4 S - 1), in nats.
 
-    Lengths and strengths, (P, 4 S), are those of `_boundary_strengths`; weights, (P,), are of edges of one unit.
+    Lengths and strengths, (P, 4 S), come from `_boundary_strengths`; weights, (P,), are nats for edges of strength 1.
     """
     there = np.minimum(lengths[:, 1:], lengths[:, :-1]) >= SHORTEST
     mean = (strengths[:, 1:] + strengths[:, :-1]) / np.maximum(lengths[:, 1:] + lengths[:, :-1], 1)
@@ -157,11 +161,11 @@ def _mean_field_round(
     pairs: np.ndarray, log_likelihood: np.ndarray, begin: np.ndarray, ends: np.ndarray, log_prior: np.ndarray,
     posterior: np.ndarray,
 ) -> None:  # fmt: skip
-    """Update the posterior of each region in turn, given those of the regions that it touches.
+    """Update the posterior of each region in turn, in place, given those of the regions that it touches.
 
-    With the log-likelihood of each move of the boundary of each pair of regions, (P, 2), that touch, (P, 4 S - 1); the
-    ends of the pairs, (2 P,), and where those of each region begin, (R + 1,); the log of the prior of each shift,
-    (2 S + 1,); and the posterior, (R, 2 S + 1), changed in place.
+    `pairs`, (P, 2), are regions that touch; `log_likelihood`, (P, 4 S - 1), is that of each move of their boundary.
+    `ends`, (2 P,), are the ends of the pairs sorted by region, and `begin`, (R + 1,), is where each region's begin.
+    `log_prior` of the shifts is (2 S + 1,), `posterior` is (R, 2 S + 1).
     """
     num_shifts, middle = log_prior.shape[0], log_likelihood.shape[1] // 2
     for region in range(posterior.shape[0]):
@@ -178,9 +182,9 @@ def _mean_field_round(
 
 @kernel(parallel=True)
 def _nearest_regions(region: np.ndarray, farthest: int) -> tuple[np.ndarray, np.ndarray]:  # (H, W) int32
-    """Find for each pixel the nearest other region, by spreading from boundary pixels, band by band.
+    """Find the nearest other region of each pixel by spreading from boundary pixels, in parallel bands of rows.
 
-    Returns the region, (H, W) int32, -1 if it is farther; and how far it is in px, rounded up, (H, W) int32, 0 if so.
+    Returns the region, (H, W) int32, and its distance in px, rounded up, (H, W) int32: -1 and 0 beyond `farthest` px.
     """
     height, width = region.shape
     borders = _borders(region)
@@ -206,7 +210,7 @@ def _nearest_regions(region: np.ndarray, farthest: int) -> tuple[np.ndarray, np.
 
 @called_by_kernels
 def _borders(region: np.ndarray) -> np.ndarray:
-    """Find pixels that touch another region, over sides or corners, (H, W) bool."""
+    """Mark the pixels that touch another region at a side or a corner, (H, W) bool."""
     height, width = region.shape
     borders = np.zeros((height, width), np.bool_)
     for y in range(height):
@@ -227,16 +231,16 @@ def _spread_region(
     region: np.ndarray, y: int, begin: int, end: int, farthest: int, first: int, last: int, other: np.ndarray,
     away: np.ndarray,
 ) -> None:  # fmt: skip
-    """Offer a stretch of row y as the nearest region to the pixels around it, in the rows from first to last.
+    """Set the region of a run of pixels in row y as the nearest one of pixels around it, if no other is nearer.
 
-    Changed in place are `other`, (H, W), and `away`, (last - first, W): the squared distance to it.
+    Changes `other`, (H, W), and the squared distance `away`, (last - first, W), in place, in rows `first` to `last`.
     """
     own = region[y, begin]
     for v in range(max(y - farthest, first), min(y + farthest + 1, last)):
         across = int(np.sqrt(farthest**2 - (v - y) ** 2))
         left, right = max(begin - across, 0), min(end + across, region.shape[1])
         there, nearest, squares = region[v, left:right], other[v, left:right], away[v - first, left:right]
-        # No branches, so that whole vectors go through it.
+        # Without branches, so that the compiler vectorises it.
         for j in range(right - left):
             beside = max(begin - left - j, left + j - end + 1, 0)
             squared = np.int32((v - y) ** 2 + beside * beside)
@@ -249,11 +253,11 @@ def _spread_region(
 def _boundary_strengths(
     region: np.ndarray, other: np.ndarray, ring: np.ndarray, edges: np.ndarray, count: int, farthest: int
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """Enumerate pairs of regions that touch, of `count` in all, and sum up edges by pair and ring; images are (H, W).
+    """List the pairs of touching regions, of `count` regions, and sum edges by pair and ring; images are (H, W).
 
-    Returns the pairs, the lower number first, (P, 2) int64; which of them each pixel is near, -1 for none, (H W,)
-    int32; and pixels and sum of their edges, from the farthest ring inside the second region to that inside the first,
-    (P, 2 farthest) float64 each.
+    A ring is the set of pixels at one distance from the boundary. Returns the pairs, lower number first, (P, 2) int64;
+    the pair that each pixel is near, (H W,) int32, -1 for none; and for each ring its number of pixels and its sum of
+    edges, (P, 2 farthest) float64 each, from the farthest in the second region to the farthest in the first.
     """
     of_pixel, of_other, rings, strength = region.ravel(), other.ravel(), ring.ravel(), edges.ravel()
     begin, order = _sort_by_lower_region(of_pixel, of_other, count)
@@ -277,7 +281,7 @@ def _boundary_strengths(
 
 @called_by_kernels
 def _sort_by_lower_region(of_pixel: np.ndarray, of_other: np.ndarray, count: int) -> tuple[np.ndarray, np.ndarray]:
-    """Sort the pixels near another region by the lower number of the two: where each begins, and the pixels."""
+    """Sort the pixels near another region by the lower region number; return each number's start, and the pixels."""
     begin = np.zeros(count + 1, np.int64)
     for p in range(of_pixel.shape[0]):
         if of_other[p] >= 0:
@@ -297,7 +301,7 @@ def _move(
     region: np.ndarray, other: np.ndarray, ring: np.ndarray, pair: np.ndarray, pairs: np.ndarray, moved: np.ndarray,
     label: np.ndarray, labels: np.ndarray,
 ) -> None:  # fmt: skip
-    """Move the boundary of each pair by so many px, (P,), into its first region, in labels (H, W); label is (R,)."""
+    """Move the boundary of each pair `moved` px, (P,), into its first region, in `labels`, (H, W); `label` is (R,)."""
     height, width = region.shape
     for y in range(height):
         for x in range(width):

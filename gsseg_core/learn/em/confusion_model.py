@@ -1,4 +1,4 @@
-"""Error model of one view: a confusion matrix in the manner of Dawid & Skene, with a prior and outliers."""
+"""Error model of one view: a confusion matrix as in Dawid & Skene (1979), with a prior and outliers."""
 
 from __future__ import annotations
 
@@ -10,9 +10,9 @@ from gsseg_core.data.label_evidence import LabelEvidence
 from gsseg_core.data.label_images import UNKNOWN
 
 PART_PRIOR = 3000.0
-"""Weight of the prior on how a class's pixels under one word divide between rejected regions and the rest, in px.
+"""Weight, in px, of the prior on how the pixels of a class with one word divide into rejected regions and the rest.
 
-A class with few pixels there is taken to divide as all classes together do.
+For a class with few such pixels, the division of all classes together is used.
 """
 
 
@@ -20,14 +20,14 @@ A class with few pixels there is taken to divide as all classes together do.
 class ErrorModel:
     """Probability of each label of one view's mask given the true class.
 
-    Rows of the confusion matrix are kept of the classes that the view shows: of thousands, these are a few hundred.
+    Only rows of classes that the view shows are stored: a few hundred of thousands.
     """
 
-    evidence: LabelEvidence  # of the L labels that occur in the view's mask, in a vocabulary of W words
+    evidence: LabelEvidence  # of the L labels in the view's mask, in a vocabulary of W words
     num_classes: int  # K
-    shown: np.ndarray  # (R,) int64: classes whose rows are known
-    rows: np.ndarray  # (R, W) float32: these
-    other: float  # what all other rows hold
+    shown: np.ndarray  # (R,) int64: classes whose rows are stored
+    rows: np.ndarray  # (R, W) float32: their rows
+    other: float  # value of all entries of the other rows
     pseudo_counts: np.ndarray  # (T,) float64: a_v, px added to the count of the correct word of each class that has one
     outliers: float  # share of pixels labelled by chance
     areas: np.ndarray  # (L,) px with each label
@@ -36,7 +36,7 @@ class ErrorModel:
     def without_errors(
         cls, evidence: LabelEvidence, num_classes: int, outliers: float, areas: np.ndarray  # (L,) px
     ) -> ErrorModel:  # fmt: skip
-        """Make the model of a segmenter whose labels are all correct."""
+        """Return the model of a segmenter whose labels are all correct."""
         classes, words = evidence.correct_words(num_classes)
         rows = np.zeros((len(classes), len(evidence.vocabulary)), np.float32)
         rows[np.arange(len(classes)), words] = 1.0
@@ -55,24 +55,24 @@ class ErrorModel:
 
     @property
     def confusion(self) -> np.ndarray:
-        """R_v, (K, W) float32: rows, true classes, sum to 1; columns are `evidence.vocabulary`."""
+        """Confusion matrix R_v, (K, W) float32; rows, true classes, sum to 1; columns are `evidence.vocabulary`."""
         confusion = np.full((self.num_classes, self.rows.shape[1]), self.other, np.float32)
         confusion[self.shown] = self.rows
         return confusion
 
     @property
     def num_pixels(self) -> int:
-        """Pixels with a label that is informative."""
+        """Number of pixels with an informative label."""
         return int(self.areas[self.evidence.informative].sum())
 
     @property
     def named_pixels(self) -> int:
-        """Pixels with a label that says which class they are of, not only of which they are not."""
+        """Number of pixels whose label names a class and does not only exclude classes."""
         return int(self.areas[self.evidence.informative & (self.evidence.named() != UNKNOWN)].sum())
 
     @property
     def likelihood(self) -> np.ndarray:
-        """C_v: probability of each label given the class, (K, L) float32."""
+        """Probability C_v of each label given the class, (K, L) float32."""
         words: np.ndarray = (1 - self.outliers) * self.confusion + np.float32(self.outliers / self.rows.shape[1])
         only = self.evidence.only_words
         if only is not None:
@@ -83,31 +83,30 @@ class ErrorModel:
 
     @property
     def by_label(self) -> np.ndarray:
-        """C_v by label, (L, K) float32."""
+        """Transposed `likelihood`: C_v by label, (L, K) float32."""
         return np.ascontiguousarray(self.likelihood.T)
 
     def used(self, by_label: np.ndarray) -> np.ndarray:  # (L, K)
-        """Return C_v by label with zeros for labels that are not informative.
+        """Return C_v by label, with zeros for labels that are not informative.
 
-        Under such a label all classes are equally likely, so its pixels would change how soon EM ends, but not where.
+        All classes are equally likely under such a label. Its pixels would change how soon EM converges, but not to
+        what.
         """
         return np.where(self.evidence.informative[:, None], by_label, np.float32(0))
 
     def expected_counts(self, counts: np.ndarray) -> np.ndarray:
-        """Return the expected number of pixels (K, W) with each true class and each word seen.
+        """Return the expected number of pixels (K, W) with each true class and each observed word.
 
-        The counts are px of each class under each label, (K, L), divided by the label's likelihood.
+        `counts` are the px of each class under each label, (K, L), divided by the label's likelihood.
         """
         return _by_word(self.evidence, counts) * (1 - self.outliers) * self.confusion
 
     def m_step(self, counts: np.ndarray) -> ErrorModel:
-        """Return it with the confusion matrix of most posterior density for expected counts, (K, W) px.
+        """Return the model with the MAP confusion matrix for expected counts, (K, W) px; rows without counts stay.
 
-        Rows without any count stay.
-
-        A rejected region is a word of its own, and a part of the word that its pixels had before. C[k, word] is
-        estimated of both together, then divided: C[k, part] = C[k, word] P(part | k, word), the latter with a prior of
-        `PART_PRIOR` px. So where a view calls an object by another's name, all of the object's regions count as one.
+        A rejected region is a word of its own, and also a part of the word that its pixels had before. C[k, word] is
+        estimated from both together and then divided: C[k, part] = C[k, word] P(part | k, word), where P has a prior of
+        `PART_PRIOR` px. So if a view gives an object the label of another one, all regions of the object count as one.
         """
         former = self.evidence.former_words
         counts = counts.astype(np.float64)
@@ -127,11 +126,14 @@ class ErrorModel:
 
 
 def _by_word(evidence: LabelEvidence, counts: np.ndarray, *, divided: bool = False) -> np.ndarray:  # (K, L)
-    """Sum counts under each label by the words that it can mean, (K, W): by their plausibility, or its shares."""
+    """Sum the counts of each label over the words that it can mean, (K, W), weighted by plausibility.
+
+    If `divided`, the plausibilities of a label are scaled to sum to 1.
+    """
     only = evidence.only_words
     if evidence.mass is None:
         return counts
-    if only is not None:  # A product of matrices would take as long as there are words, for nothing but zeros.
+    if only is not None:  # A matrix product would spend its time, proportional to the number of words, on zeros.
         order, words = np.argsort(only, kind="stable"), np.zeros((len(evidence.vocabulary), len(counts)))
         first = np.flatnonzero(np.diff(only[order], prepend=-1))
         words[only[order][first]] = np.add.reduceat(counts.T[order], first, axis=0)

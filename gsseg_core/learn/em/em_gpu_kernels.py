@@ -1,7 +1,7 @@
-"""What `em_kernels` does with the (Gaussian, label) pairs of a view, on a GPU.
+"""EM kernels for the (Gaussian, label) pairs of one view, on a GPU: the functions of `em_kernels`.
 
-There is one thread to each Gaussian that the view sees. Sums over Gaussians are of whole units, so that they do not
-depend on the order in which threads come to add.
+Each Gaussian that the view sees has one thread. Sums over Gaussians are integers, so they do not depend on the order in
+which threads add.
 """
 
 from __future__ import annotations
@@ -21,20 +21,20 @@ from gsseg_core.raster.gpu.label_sharing import halves, joined
 from gsseg_core.raster.gpu.tensors import PairTensors, RowTensors, starts
 from gsseg_core.raster.observation import Observation
 
-_CELLS = 1 << 20  # of all tables that are counted in, at most, unless one alone is larger
-_PX = 1 / GRADIENT_UNIT  # units of a px, in counts as in gradients
+_CELLS = 1 << 20  # most cells of all count tables together, unless a single table is larger
+_PX = 1 / GRADIENT_UNIT  # units per px, in counts and in gradients
 _MOST = np.float32(MAX_TERM)
 _NOTHING = np.float32(0)
 
 
 def pairs_of(observation: Observation) -> PairTensors:
-    """Take the pairs of an observation."""
+    """Return the pairs of an observation."""
     assert isinstance(observation, GPUObservation)
     return observation.pairs
 
 
 def by_row(pairs: PairTensors) -> PairTensors:
-    """Count the Gaussians of a view by their own rows."""
+    """Replace Gaussian ids by positions among the view's Gaussians, to index arrays that only have rows for these."""
     return pairs._replace(ids=torch.arange(len(pairs.ids), dtype=torch.int32, device=pairs.ids.device))
 
 
@@ -50,7 +50,7 @@ def returned(array: torch.Tensor) -> np.ndarray:
 
 
 def zeros(rows: RowTensors, kind: type[np.generic]) -> torch.Tensor:
-    """Make one zero for each entry of some rows, on the GPU."""
+    """Return one zero for each entry of some rows, on the GPU."""
     return torch.zeros(len(rows.data), dtype=_KINDS[kind], device=rows.indptr.device)
 
 
@@ -58,20 +58,20 @@ _KINDS: dict[type[np.generic], torch.dtype] = {np.int64: torch.int64, np.float32
 
 
 def rows_like(rows: RowTensors, ids: torch.Tensor) -> RowTensors:  # (M,)
-    """Make M rows as long as those of `ids`, with nothing written into them."""
+    """Allocate M rows as long as those of `ids`, without initialising them."""
     indptr = starts(rows.indptr.diff()[ids.long()])
     total = int(indptr[-1])
     return RowTensors(indptr, rows.indices.new_empty(total), rows.data.new_empty(total))
 
 
 def shares(observation: Observation, codes: RowTensors, pairs: PairTensors, likelihood: np.ndarray) -> ShareTensors:
-    """Share one vote per labelled pixel among its pairs by class probabilities, as `Observation.shares` does."""
+    """Share one vote per labelled pixel among its pairs by class probabilities, as in `Observation.shares`."""
     assert isinstance(observation, GPUObservation)
     return observation.shared(pair_likelihood(codes, pairs, likelihood), likelihood[:, 0])
 
 
 def pair_likelihood(codes: RowTensors, pairs: PairTensors, likelihood: np.ndarray) -> torch.Tensor:
-    """Likelihood of the label of each (Gaussian, label) pair, codes[i] . likelihood[y]: (P,) float32."""
+    """Return the likelihood of the label of each (Gaussian, label) pair, codes[i] . likelihood[y]: (P,) float32."""
     out = torch.empty(len(pairs.labels), device=codes.data.device)
     launch_each(_pair_likelihood, len(pairs.ids), *codes, *pairs, on_device(likelihood, out.device), out)
     return out
@@ -98,7 +98,7 @@ def _units(pixels: Any) -> Any:
 
 
 def accumulate(gradient: RowTensors, pairs: PairTensors, likelihood: np.ndarray, shares: torch.Tensor) -> None:
-    """Add one view's term to the gradient: sum over a Gaussian's pairs of share times likelihood of the label."""
+    """Add one view's term to the gradient: the sum over a Gaussian's pairs of share times likelihood of the label."""
     launch_each(_accumulate, len(pairs.ids), *gradient, *pairs, on_device(likelihood, shares.device), shares)
 
 
@@ -120,7 +120,7 @@ def m_step_without_view(
     codes: RowTensors, gradient: torch.Tensor, prior: torch.Tensor, pairs: PairTensors, likelihood: np.ndarray,
     shares: torch.Tensor, stepped: RowTensors,
 ) -> None:  # fmt: skip
-    """M-step of the M Gaussians that a view sees, with the gradient less what `accumulate` added for this view."""
+    """M-step of the M Gaussians that a view sees, with the gradient minus the term that `accumulate` added for it."""
     of_labels = on_device(likelihood, shares.device)
     launch_each(_m_step_without_view, len(pairs.ids), *codes, gradient, prior, *pairs, of_labels, shares, *stepped)
 
@@ -150,14 +150,14 @@ def _m_step_without_view(
 def confusion_counts(
     codes: RowTensors, pairs: PairTensors, shares: torch.Tensor, num_classes: int, num_labels: int
 ) -> np.ndarray:
-    """Sum over the pairs of codes[m] times share, by class and label, (K, L) float64; row m is of `pairs.ids[m]`."""
+    """Sum codes[m] times share over the pairs, by class and label, (K, L) float64; row m belongs to `pairs.ids[m]`."""
     counts = _counters(num_classes, num_labels, shares.device)
     launch_each(_confusion_counts, len(pairs.ids), *codes, *pairs[1:], shares, counts)
     return _in_px(counts)
 
 
 def _counters(num_classes: int, num_labels: int, device: torch.device) -> torch.Tensor:
-    """Make tables to count in, (C, K, L): most pairs are of few cells, where threads would wait for each other."""
+    """Make C count tables, (C, K, L): most pairs add to the same few cells, where threads of one table would wait."""
     tables = max(min(_CELLS // max(num_classes * num_labels, 1), 64), 1)
     return torch.zeros((tables, num_classes, num_labels), dtype=torch.int64, device=device)
 
@@ -179,7 +179,7 @@ def _confusion_counts(
 
 
 def subtract_votes(total: RowTensors, observation: Observation, label_votes: CSRRows) -> None:
-    """Subtract one view's votes, by `LabelEvidence.votes`, from those of all, N rows of int64, in place."""
+    """Subtract one view's votes, by `LabelEvidence.votes`, from those of all views, N rows of int64, in place."""
     assert isinstance(observation, GPUObservation)
     pairs, own = observation.pairs, observation.own_votes
     launch_each(_subtract_votes, len(pairs.ids), *total, *pairs, own, *RowTensors.of(label_votes, own.device))
@@ -201,7 +201,7 @@ def _own_votes(
     k: int, m: int, start: np.ndarray, labels: np.ndarray, own: np.ndarray,  # class, and Gaussian of the view
     vote_indptr: np.ndarray, vote_classes: np.ndarray, votes: np.ndarray,
 ) -> Any:  # fmt: skip
-    """Units that the view votes for a class, rounded pair by pair as when they were added."""
+    """Return the view's votes for a class, in units, with the rounding per pair with which they were added."""
     units = np.int64(0)
     for s in range(start[m], start[m + 1]):
         for j in range(vote_indptr[labels[s]], vote_indptr[labels[s] + 1]):
@@ -214,7 +214,7 @@ def leave_one_out_counts(
     votes: RowTensors, observation: Observation, possible: np.ndarray, evidence: LabelEvidence, power: float = 1.0,
     most: float = np.inf,
 ) -> np.ndarray:  # fmt: skip
-    """Count the pixels (K, L) of each class under each label of a view by the votes of all others, none against."""
+    """Count the pixels (K, L) of each class under each label of a view by the votes of all others, all at least 0."""
     assert isinstance(observation, GPUObservation)
     pairs, own = observation.pairs, observation.own_votes
     label_votes, rest = RowTensors.of(evidence.votes, own.device), rows_like(votes, pairs.ids)

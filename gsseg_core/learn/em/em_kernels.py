@@ -1,8 +1,8 @@
-"""What EM does with the (Gaussian, label) pairs of one view, on the CPU; `em_gpu_kernels` has the same for a GPU.
+"""EM kernels for the (Gaussian, label) pairs of one view, on the CPU; `em_gpu_kernels` has the same for a GPU.
 
-Class probabilities, `codes`, are N rows of Z entries in all, `CSRRows` of float32; each entry has a `gradient`, (Z,)
-int64 in units of `GRADIENT_UNIT`, and a `prior`, (Z,) float32 in px. The `likelihood` of each label given the class is
-(L, K) float32. `shares`, (P,) float32, are those of the pairs in one vote per labelled pixel.
+The class probabilities `codes` are `CSRRows` of float32: N rows with Z entries in total. Each entry has a `gradient`,
+(Z,) int64 in units of `GRADIENT_UNIT`, and a `prior`, (Z,) float32 in px. The `likelihood` of each label given the
+class is (L, K) float32. `shares`, (P,) float32, are how the pairs share one vote per labelled pixel.
 """
 
 from __future__ import annotations
@@ -26,62 +26,62 @@ from gsseg_core.simd import intrinsic
 
 T = TypeVar("T")
 
-BLOCKS = 16  # counts are summed in this many parts, then together, so that they do not depend on the number of threads
-_AT_ONCE = 1 << 23  # numbers of such parts that there is memory for at a time; one part at least
+BLOCKS = 16  # counts are summed in this fixed number of parts, so that results do not depend on the number of threads
+_AT_ONCE = 1 << 23  # entries of such parts to hold in memory at a time; at least one part is held
 
 GRADIENT_UNIT = 2.0**-24
-"""Gradients are sums of whole multiples of this, in px, so they depend neither on the order of views nor on where."""
+"""Unit of gradients, in px: integer sums depend neither on the order of views nor on the device or worker."""
 
 _GRADIENT_UNIT = np.float32(GRADIENT_UNIT)
 
 MAX_TERM = 2.0**27 - 8
-"""Most that one pair can add to a gradient, in px. More occurs only where a class has next to no probability, which
-then rises less in this step."""
+"""Most that one pair can add to a gradient, in px. Larger terms occur only if a class has almost no probability; the
+limit then slows its rise in this step."""
 
-# Float64 are GRADIENT_UNIT apart here: what is added to this is rounded to whole units, which are its last bits.
+# Near this value, float64 numbers are GRADIENT_UNIT apart: a sum with it is rounded to whole units, in its last bits.
 _ROUND = 1.5 * 2.0**28
 _ROUND_BITS = int(np.float64(_ROUND).view(np.int64))
 
 
 def pairs_of(observation: Observation) -> ViewPairs:
-    """Take the pairs of an observation."""
+    """Return the pairs of an observation."""
     return ViewPairs(observation.ids, observation.start, observation.labels)
 
 
 def by_row(pairs: ViewPairs) -> ViewPairs:
-    """Replace ids in the scene by places among the Gaussians of the view: rows of arrays that hold these alone."""
+    """Replace Gaussian ids by positions among the view's Gaussians, to index arrays that only have rows for these."""
     return pairs._replace(ids=np.arange(len(pairs.ids), dtype=np.int32))
 
 
 def rows_like(rows: CSRRows, ids: np.ndarray) -> CSRRows:  # (M,)
-    """Make M rows as long as those of `ids`, with nothing written into them."""
+    """Allocate M rows as long as those of `ids`, without initialising them."""
     return CSRRows.room_for(np.diff(rows.indptr)[ids], rows.data.dtype)
 
 
 def put(values: T, device: str) -> T:
-    """Return an array, or rows, as they are: on the CPU, kernels work on them where they lie."""
+    """Return an array, or rows, unchanged: CPU kernels use them in place."""
     del device
     return values
 
 
 def returned(array: np.ndarray) -> np.ndarray:
-    """Return an array that kernels have worked on as it is."""
+    """Return an array that kernels have changed; on the CPU nothing has to be copied back."""
     return array
 
 
 def zeros(rows: CSRRows, kind: type[np.generic]) -> np.ndarray:
-    """Make one zero for each entry of some rows."""
+    """Return one zero for each entry of some rows."""
     return np.zeros(len(rows.data), kind)
 
 
 def shares(observation: Observation, codes: CSRRows, pairs: ViewPairs, likelihood: np.ndarray) -> VoteShares:
-    """Share one vote per labelled pixel among its pairs by class probabilities, as `Observation.shares` says."""
+    """Share one vote per labelled pixel among its pairs by class probabilities, as in `Observation.shares`."""
     return observation.shares(pair_likelihood(codes, pairs, likelihood), likelihood[:, 0])
 
 
 @intrinsic
 def rounded_to_units(_: Any, __: Any) -> Any:
-    """Round px, float32 of at least 0, to int64 in units of GRADIENT_UNIT, by instructions that vector units have."""
+    """Round px, float32 of at least 0, to int64 in units of GRADIENT_UNIT, with vector (SIMD) instructions only."""
 
     def write(_: Any, llvm: Any, __: Any, arguments: Sequence[Any]) -> Any:
         most, double, bits = ir.Constant(ir.FloatType(), MAX_TERM), ir.DoubleType(), ir.IntType(64)
@@ -94,7 +94,7 @@ def rounded_to_units(_: Any, __: Any) -> Any:
 
 @kernel(parallel=True, fastmath={"contract", "reassoc"})
 def pair_likelihood(codes: CSRRows, pairs: ViewPairs, likelihood: np.ndarray) -> np.ndarray:
-    """Likelihood of the label of each (Gaussian, label) pair, codes[i] . likelihood[y]: (P,) float32."""
+    """Return the likelihood of the label of each (Gaussian, label) pair, codes[i] . likelihood[y]: (P,) float32."""
     indptr, classes, data = codes
     ids, start, labels = pairs
     out = np.empty(labels.shape[0], np.float32)
@@ -111,7 +111,7 @@ def pair_likelihood(codes: CSRRows, pairs: ViewPairs, likelihood: np.ndarray) ->
 
 @kernel(parallel=True)
 def accumulate(gradient: CSRRows, pairs: ViewPairs, likelihood: np.ndarray, shares: np.ndarray) -> None:
-    """Add one view's term to the gradient: sum over a Gaussian's pairs of share times likelihood of the label."""
+    """Add one view's term to the gradient: the sum over a Gaussian's pairs of share times likelihood of the label."""
     indptr, classes, data = gradient
     ids, start, labels = pairs
     for m in nb.prange(ids.shape[0]):
@@ -125,9 +125,9 @@ def accumulate(gradient: CSRRows, pairs: ViewPairs, likelihood: np.ndarray, shar
 
 @kernel(parallel=True)
 def m_step(codes: CSRRows, gradient: np.ndarray, prior: np.ndarray) -> None:
-    """M-step: set the codes to normalise(codes * gradient + prior), in place; where that is zero, a row stays as it is.
+    """M-step: set the codes to normalise(codes * gradient + prior), in place; rows for which this is zero stay.
 
-    So a Gaussian without a prior that only blocks left out see keeps what the votes say.
+    So a Gaussian without a prior that is seen only in skipped blocks keeps the probabilities from its votes.
     """
     indptr, _, data = codes
     for i in nb.prange(indptr.shape[0] - 1):
@@ -141,7 +141,7 @@ def m_step(codes: CSRRows, gradient: np.ndarray, prior: np.ndarray) -> None:
 
 @kernel(parallel=True)
 def predicted_gain(codes: CSRRows, gradient: np.ndarray, prior: np.ndarray) -> float:
-    """Slope of J along the step that `m_step` takes, in nats, at least 0: an upper bound of what it gains.
+    """Return the slope of J along the step of `m_step`, in nats, at least 0: an upper bound of the step's gain.
 
     With p = codes * gradient + prior, the gradient of J is p / codes, and the step leads to p / sum(p).
     """
@@ -165,9 +165,9 @@ def m_step_without_view(
     codes: CSRRows, gradient: np.ndarray, prior: np.ndarray, pairs: ViewPairs, likelihood: np.ndarray,
     shares: np.ndarray, stepped: CSRRows,
 ) -> None:  # fmt: skip
-    """M-step of the M Gaussians that a view sees, with the gradient less what `accumulate` added for this view.
+    """M-step of the M Gaussians that a view sees, with the gradient minus the term that `accumulate` added for it.
 
-    Written are the classes and the entries of `stepped`, M rows.
+    Writes the classes and entries of `stepped`, M rows.
     """
     indptr, classes, data = codes
     ids, start, labels = pairs
@@ -190,12 +190,12 @@ def m_step_without_view(
 def confusion_counts(
     codes: CSRRows, pairs: ViewPairs, shares: np.ndarray, num_classes: int, num_labels: int
 ) -> np.ndarray:
-    """Sum over the pairs of codes[m] times share, by class and label, (K, L) float64; row m is of `pairs.ids[m]`."""
+    """Sum codes[m] times share over the pairs, by class and label, (K, L) float64; row m belongs to `pairs.ids[m]`."""
     return _in_parts((num_classes, num_labels), partial(_count_confusions, codes, pairs, shares))
 
 
 def _in_parts(shape: tuple[int, int], count: Callable[[int, np.ndarray], None]) -> np.ndarray:
-    """Add up tables of all blocks: `count` takes the first block of some, and their tables as zeros, to be filled."""
+    """Sum the tables of all blocks; `count` gets the first of some blocks, and fills their tables, which are zeros."""
     total = np.zeros(shape)
     parts = np.zeros((min(max(_AT_ONCE // max(total.size, 1), 1), BLOCKS), *shape))
     for first in range(0, BLOCKS, len(parts)):
@@ -207,7 +207,7 @@ def _in_parts(shape: tuple[int, int], count: Callable[[int, np.ndarray], None]) 
 
 @kernel(parallel=True)
 def _move_into(total: np.ndarray, parts: np.ndarray) -> None:
-    """Add tables to a total, one after the other, and leave zeros, which is most of what they are, in them."""
+    """Add tables to a total one after the other and reset them to zero; most entries are zero and are skipped."""
     for k in nb.prange(total.shape[0]):
         for place in range(parts.shape[0]):
             for y in range(total.shape[1]):
@@ -229,17 +229,17 @@ def _count_confusions(codes: CSRRows, pairs: ViewPairs, shares: np.ndarray, begi
 
 
 def leave_one_out_counts(
-    votes: CSRRows,  # int64, of all views, this one among them
+    votes: CSRRows,  # int64, of all views including this one
     observation: Observation,
     possible: np.ndarray,  # (K,) bool: ids that are classes
-    evidence: LabelEvidence,  # which the view has voted with
+    evidence: LabelEvidence,  # with which the view voted
     power: float = 1.0,
     most: float = np.inf,
 ) -> np.ndarray:
-    """Count the pixels (K, L) of each class under each label of a view by the votes of all other views.
+    """Count the pixels of each class under each label of a view, by the votes of all other views: (K, L) float64.
 
-    Probabilities are raised to a power, and normalised, before they are counted: above 1, majorities stand out. A
-    Gaussian counts at most `most` times the pixels that the other views saw of it.
+    Probabilities are raised to `power` and normalised before they are counted; a power above 1 favours majorities. A
+    Gaussian counts for at most `most` times the pixels that the other views saw of it.
     """
     pairs, own, class_ids = pairs_of(observation), observation.votes(), np.flatnonzero(possible)
     count = partial(_count, votes, pairs, own, evidence.votes, class_ids, power, most)
@@ -247,7 +247,7 @@ def leave_one_out_counts(
 
 
 def subtract_votes(total: CSRRows, observation: Observation, label_votes: CSRRows) -> None:
-    """Subtract one view's votes, by `LabelEvidence.votes`, from those of all, N rows of int64, in place."""
+    """Subtract one view's votes, by `LabelEvidence.votes`, from those of all views, N rows of int64, in place."""
     _subtract_votes(total, pairs_of(observation), observation.votes(), label_votes)
 
 
@@ -263,11 +263,11 @@ def _subtract_votes(total: CSRRows, pairs: ViewPairs, own: np.ndarray, label_vot
 
 @called_by_kernels
 def _subtract_row(
-    classes: np.ndarray, total: np.ndarray, first: int, last: int,  # of these, the row of one Gaussian
-    labels: np.ndarray, own: np.ndarray, begin: int, end: int,  # of these, its pairs
+    classes: np.ndarray, total: np.ndarray, first: int, last: int,  # the Gaussian's row is first to last
+    labels: np.ndarray, own: np.ndarray, begin: int, end: int,  # its pairs are begin to end
     label_votes: CSRRows,
 ) -> None:  # fmt: skip
-    """Subtract one view's votes from the row of one Gaussian, rounded as when they were added."""
+    """Subtract one view's votes from the row of one Gaussian, with the rounding with which they were added."""
     indptr, vote_classes, votes = label_votes
     for s in range(begin, end):
         for j in range(indptr[labels[s]], indptr[labels[s] + 1]):
@@ -278,7 +278,7 @@ def _subtract_row(
 
 @called_by_kernels
 def _raised(x: np.float32, power: float) -> np.float32:
-    """Return x ** power in float32, of a whole power by products."""
+    """Return x ** power in float32; integer powers are computed by products."""
     result, factor, left = np.float32(1), x, int(power)
     if power != left:
         return np.float32(x**power)
@@ -296,8 +296,8 @@ def _count(
 ) -> None:  # fmt: skip
     """Count as `leave_one_out_counts` does, row by row, so that the votes of the other views are never stored.
 
-    The counts are the sum over all blocks; `parts`, (B, K, L) float64, are of those from `begin` on, and come as zeros.
-    The ids of classes are ascending; other arrays are those of `_subtract_votes`.
+    `parts`, (B, K, L) float64, are the counts of B blocks from block `begin` on; they must be zeros at first. The
+    result is the sum over all blocks. `class_ids` are ascending; other arrays are those of `_subtract_votes`.
     """
     indptr, classes, data = votes
     ids, start, labels = pairs
@@ -325,7 +325,7 @@ def _count(
             if total == 0:
                 continue
             raised, pixels = np.float32(0), np.float64(0)
-            for z in range(count):  # As shares of the largest, of which some power is never lost to rounding.
+            for z in range(count):  # Relative to the largest, so that powers do not all underflow to 0.
                 codes[z] = _raised(np.float32(remaining[z]) / np.float32(largest), power)
                 raised += codes[z]
             for s in range(start[m], start[m + 1]):

@@ -1,23 +1,23 @@
 """Expectation maximisation (EM) of class probabilities, with a confusion matrix for each view: the default learner.
 
-This is the model of Dawid & Skene (1979) with views as annotators and Gaussians as items, except that an annotation, a
-pixel's label, depends on all Gaussians along a ray. docs/method.md, "Learners", has the model, the objective J and its
-reasons; here is what the names below stand for, with q (N, K) the class probabilities and C_v[k, y] the probability of
-label y in view v given class k:
+The model is that of Dawid & Skene (1979): views are annotators, Gaussians are items. The difference is that an
+annotation, which is the label of a pixel, depends on all Gaussians along a ray. docs/method.md, "Learners", explains
+the model and the objective J. Below, q (N, K) are the class probabilities, and C_v[k, y] is the probability of label y
+in view v given class k:
 
-- `_e_step` sums over the views gradient[i, k] = dlogL / dq_i[k] = sum_v sum_y C_v[k, y] B_v[i, y], with B_v[i, y] the
-  sum of w_v[p, i] / p_v(y | p) over the pixels p of label y. q * gradient are the expected counts, in px. Not all
-  pixels are gone through, and some count for others (`block_weights`).
+- `_e_step` sums over the views gradient[i, k] = dlogL / dq_i[k] = sum_v sum_y C_v[k, y] B_v[i, y], where B_v[i, y] is
+  the sum of w_v[p, i] / p_v(y | p) over the pixels p of label y. q * gradient are the expected counts, in px. The sum
+  skips some blocks of pixels and gives others a larger weight instead (`block_weights`).
 - `m_step` sets q_i to normalise(q_i gradient_i + prior_i), the exact maximiser of the usual lower bound, so J never
-  falls. prior_i is `prior_weight` times the mean of the votes' probabilities over the nearest Gaussians, the better
-  seen the more (`spatial_prior`); where masks vote against classes it is taken once more, from the probabilities.
-- `predicted_gain` is the slope of J along the step. J is concave, so no step gains more; fitting ends with the first
-  step that cannot gain `tolerance`.
+  falls. prior_i is `prior_weight` times the mean vote probabilities of the nearest Gaussians, weighted by how well each
+  was seen (`spatial_prior`). If masks vote against classes, it is computed again later, from the probabilities.
+- `predicted_gain` is the slope of J along the step. J is concave, so a step gains at most this much. Fitting ends with
+  the first step that cannot gain `tolerance`.
 - `_refit_error_models` re-estimates each view's confusion matrix from probabilities that leave this view out, since
   probabilities that were fitted to a mask agree with its errors.
 
 Before the first step, the boundaries of each mask are aligned with edges of the scene (`boundary_alignment`), and
-regions whose label the votes of all other views contradict lose it (`rejected_regions`).
+labels of regions that the votes of all other views contradict are rejected (`rejected_regions`).
 """
 
 from __future__ import annotations
@@ -52,13 +52,13 @@ from gsseg_core.scene.gaussian_scene import GaussianScene
 from gsseg_core.several_at_once import meanwhile
 from gsseg_core.spatial.neighbourhood import find_neighbours
 
-REFIT_FACTOR = 4  # error models are re-estimated once a step gains less than this many times the tolerance
+REFIT_FACTOR = 4  # error models are re-estimated once a step gains less than this multiple of the tolerance
 
 Tick = Callable[[], None]
-"""Called for each view, so that whoever listens can stop the work at once."""
+"""Called for each view; it may raise an error to stop the work."""
 
 OverViews = tuple[Any, dict[str, Any]]
-"""What comes of some views: a sum over them, of int64, perhaps sparse, or None; and by view what else came out."""
+"""Result over some views: an int64 array summed over them (perhaps sparse) or None; and further results by view."""
 
 
 @dataclass(frozen=True)
@@ -68,30 +68,31 @@ class EMSettings:
     Attributes
     ----------
     max_steps : int
-        Steps at most; scikit-learn's `max_iter`.
+        Maximum number of steps; scikit-learn's `max_iter`.
     tolerance : float
-        Stop with a step that gains less than this, in nats per labelled pixel; scikit-learn's `tol`. Where only a share
-        s of the pixels names a class, as in partial masks, each step gains less of more: with less than s^2 of this.
+        Stop with a step that gains less than this, in nats per labelled pixel; scikit-learn's `tol`. If only a share s
+        of the pixels names a class, as in partial masks, steps gain less and more are needed: the limit is then s^2
+        times this.
     errors : bool
-        Learn a confusion matrix for each view; without, every mask is taken to be right.
+        Learn a confusion matrix for each view; if False, every mask is taken to be right.
     refits : int
-        How often error models are re-estimated once the probabilities have all but converged.
+        How often error models are re-estimated once the probabilities have almost converged.
     edge_px : int
-        Boundaries of a plain mask may be this many px too far in or out, and are moved to edges of the scene; see
-        `gsseg_core.learn.em.boundary_alignment`. 0 switches this off.
+        Move boundaries of a plain mask to edges of the scene, for masks drawn up to this many px too wide or too
+        narrow; see `gsseg_core.learn.em.boundary_alignment`. 0 switches this off.
     least_agreement : float
-        The label of a region of a mask is rejected if less than this share of the region has it by the votes of the
-        other views; see `gsseg_core.learn.em.rejected_regions`. 0 switches this off.
+        Reject the label of a mask region if the votes of the other views give it less than this share of the region;
+        see `gsseg_core.learn.em.rejected_regions`. 0 switches this off.
     majority : float
-        The first error models are counted from the votes' probabilities to this power: above 1, majorities stand out.
+        Power to which the vote probabilities are raised to count the first error models; above 1 it favours majorities.
     error_prior : float
-        Pseudo-count of correctly labelled pixels of a class, as a share of the pixels that it fills in the view.
+        Pseudo-count of correctly labelled pixels of a class, as a share of the pixels that the class fills in the view.
     outliers : float
         Share of pixels that carry any label of the view by chance, in (0, 1).
     prior_weight : float
         Weight of the spatial prior of a Gaussian, in px.
     prior_k : int
-        Neighbours that it averages.
+        Number of nearest neighbours that the spatial prior averages.
     """
 
     max_steps: int = 30
@@ -122,28 +123,28 @@ class EMSettings:
 
     @property
     def rejects_regions(self) -> bool:
-        """Whether regions of masks are tested, and may be rejected."""
+        """Whether mask regions are tested and their labels may be rejected."""
         return self.errors and self.least_agreement > 0
 
 
 class EMLearner(Learner):
-    """Class probabilities of most posterior density, by EM with a confusion matrix for each view.
+    """Learner of maximum a posteriori (MAP) class probabilities by EM, with a confusion matrix for each view.
 
     Attributes
     ----------
     error_models_ : dict of str to ErrorModel
-        After `fit`: confusion matrix of each view, what crowd-kit's `DawidSkene` calls `errors_`.
+        After `fit`: confusion matrix of each view; crowd-kit's `DawidSkene` calls them `errors_`.
     history_ : list of float
-        After `fit`: J per labelled pixel before each step, in nats; it never falls until error models are re-estimated.
+        After `fit`: J per labelled pixel before each step, in nats; it falls only when error models are re-estimated.
     rounds_ : list of int
-        After `fit`: steps with each set of error models.
+        After `fit`: number of steps with each set of error models.
     converged_ : bool
         After `fit`: whether the last step gained less than the tolerance.
     """
 
     leaves_out = checks_masks = True
     error_models_: Mapping[str, ErrorModel] = {}
-    # What the last step began with, on the device: codes, and the gradient of all views; whether any code has class 0.
+    # Input of the last step, on the device: codes, gradient over all views, and whether any code has class 0.
     _last_step_: tuple[Any, Any, bool]
 
     def __init__(
@@ -155,22 +156,22 @@ class EMLearner(Learner):
 
     @classmethod
     def default_settings(cls, max_steps: int | None, seed: int) -> tuple[EMSettings]:
-        """Return settings for the registry."""
+        """Return the default settings, with `max_steps` if given."""
         return (EMSettings(max_steps=EMSettings.max_steps if max_steps is None else max_steps),)
 
     @property
     def lower_bound_(self) -> float:
-        """J per labelled pixel, in nats, before the last step: the last entry of `history_`."""
+        """Return J per labelled pixel, in nats, before the last step: the last entry of `history_`."""
         return self.history_[-1] if self.history_ else float("nan")
 
     @property
     def loss(self) -> float:
-        """-J per labelled pixel, in nats."""
+        """Return -J per labelled pixel, in nats."""
         return -self.lower_bound_
 
     @fits_whole
     def fit(self, progress: Progress = silent) -> EMLearner:
-        """Alternate E and M steps until a step can gain no more than the tolerance."""
+        """Alternate E and M steps until a step can gain less than the tolerance, or for `max_steps`."""
         settings = self.settings
         self._require_views()
         tick = partial(progress, "em", 0, settings.max_steps)
@@ -197,7 +198,7 @@ class EMLearner(Learner):
                 models |= self._over_views(EMLearner._refit_error_models, models, tick, codes, gradient, prior.data)[1]
                 self.rounds_.append(0)
                 if votes.data.min(initial=0) < 0:
-                    # Such votes say little of what the neighbours are; the probabilities know by now.
+                    # Votes against classes predict neighbours badly; by now the probabilities do it better.
                     codes, gradient, prior = with_prior(codes, gradient, self._spatial_prior(codes, evidence))
             kernels.m_step(codes, gradient, prior.data)
             if self.converged_:
@@ -208,41 +209,41 @@ class EMLearner(Learner):
         return self
 
     def _initialize_codes(self, votes: CSRRows) -> tuple[CSRRows, CSRRows, np.ndarray]:
-        """Take a first step by the votes: class probabilities, their prior, and of how many px they are, (N,)."""
+        """Initialise from the votes: class probabilities, their prior, and the evidence per Gaussian, (N,) px."""
         resolved = resolved_votes(votes, self._possible())
         evidence = VOTE_UNIT * resolved.sums()
         resolved, prior = resolved.united(self._spatial_prior(resolved, evidence))
-        # With the prior added, J is finite from the start. What is zero now stays zero in every step, so that rows keep
-        # their classes, unless the prior is taken anew.
+        # With the prior added, J is finite from the start. Entries that are zero now stay zero in every step, so rows
+        # keep their classes until the prior is computed again.
         codes = resolved.with_data(resolved.data.astype(np.float32) * np.float32(VOTE_UNIT) + prior.data).normalised()
         return codes, prior, evidence
 
     def _compute_lower_bound(self, codes: CSRRows, prior: CSRRows, log_likelihoods: Mapping[str, float]) -> float:
-        """J, in nats: the log-likelihood of all labels, and the log of the prior but for a constant."""
+        """Return J, in nats: the log-likelihood of all labels plus the log prior, up to a constant."""
         counted = prior.data > 0
         log_prior = (prior.data[counted] * np.log(codes.data[counted])).sum(dtype=np.float64)
         return float(log_prior) + sum(log_likelihoods[name] for name in self.views)
 
     def predict_without(self, view: View) -> np.ndarray:
-        """Blend into a view the probabilities of a last step without its mask, (H, W, K) float32.
+        """Render class probabilities from the last step repeated without the view's mask, (H, W, K) float32.
 
-        The spatial prior is left out, too, so rows sum to less where no other view has seen anything. Of Gaussians that
-        no pixel of the mask lies on, which it says nothing of, the last step is not taken, and what they had stays.
+        The step also leaves out the spatial prior, so the K values of a pixel sum to less than 1 where no other view
+        saw anything. Gaussians under no labelled pixel of the view keep the probabilities from before the last step.
         """
         codes, _, background, operator = self._without(view, only_labelled=False)
         return operator.blend_probabilities(codes, self.num_classes, background)
 
     def strongest_without(self, view: View, wanted: np.ndarray | None = None, grid: PixelGrid = NO_PIXELS) -> Strongest:
-        """Tell the class of each pixel by `predict_without`, without an image of all classes."""
+        """Return the class of each pixel by `predict_without`, without making the image of all K probabilities."""
         codes, of, background, operator = self._without(view, only_labelled=wanted is not None)
         return operator.strongest(codes, self.num_classes, background, grid, of, wanted=wanted)
 
     def _without(self, view: View, *, only_labelled: bool) -> tuple[CSRRows, np.ndarray | None, bool, ViewRenderer]:
-        """Take the last step of `fit` again, without a view's mask; return what blends the outcome into the view.
+        """Repeat the last step of `fit` without a view's mask; return what is needed to render the result.
 
-        These are the codes, the ids of their Gaussians, whether any code has a share of the background, and the
-        operator. If only labelled pixels count, the codes are of the Gaussians that these see, and the operator is at
-        hand; else they are of all Gaussians, and the ids None.
+        Returns the codes, the ids of their Gaussians, whether any code has a share of the background, and the operator.
+        If `only_labelled`, the codes are those of the Gaussians that labelled pixels see, and the operator comes from
+        the observation, without projection. Otherwise the codes cover all Gaussians, and the ids are None.
         """
         model, observation, backend = self._model_of(view), self.observation(view.name), kernels_on(self.device)
         codes, gradient, background = self._last_step_
@@ -253,12 +254,12 @@ class EMLearner(Learner):
         return codes.with_rows(ids, stepped), None, background, self._operator_of(view)
 
     def rejected_share(self, view: View) -> float:
-        """Share of a view's labelled pixels that lie in rejected regions."""
+        """Return the share of a view's labelled pixels that lie in rejected regions."""
         evidence, areas = self._model_of(view).evidence, self.observation(view.name).areas
         return 0.0 if evidence.nameless is None else float(areas[evidence.nameless].sum() / areas.sum())
 
     def forget(self, name: str) -> None:
-        """Drop a view, its mask and its error model: what comes under its name has another."""
+        """Drop a view, its mask and its error model, which is wrong for a later view of the same name."""
         super().forget(name)
         self.error_models_ = {known: model for known, model in self.error_models_.items() if known != name}
 
@@ -270,14 +271,14 @@ class EMLearner(Learner):
     def _prepare(self, view: View, seen: SeenLabels, operator: ViewOperator | None = None) -> Observation:
         operator = operator or self._operator_of(view)
         used = self._used_labels(seen, operator)
-        # Without error models, what is wrong in few pixels would weigh too much: up to a point of mIoU was lost by it.
+        # Without error models, errors in the few weighted blocks would count too much: it cost up to a point of mIoU.
         weights = block_weights(used.labels, seen.hardened().labels) if self.settings.errors else None
         return operator.observe(used.labels, used.evidence, weights)
 
     def _used_labels(self, seen: SeenLabels, operator: ViewOperator) -> SeenLabels:
-        """Align boundaries of a plain mask with edges, and give each region a label if regions may be rejected."""
+        """Align boundaries of a plain mask with edges; give each region its own label if regions may be rejected."""
         settings = self.settings
-        seen = seen.hardened() if settings.errors else seen  # Errors are of whole regions, probabilities of pixels.
+        seen = seen.hardened() if settings.errors else seen  # Error models are per region, not per pixel.
         if settings.errors and settings.edge_px and seen.evidence is None:
             distance = reach(settings.edge_px) + 1  # One px more, since edges are differences.
             edges = kernels_on(self.device).scene_edges(operator, self.scene, seen.labels, distance)
@@ -285,14 +286,15 @@ class EMLearner(Learner):
         return split_regions(seen) if settings.rejects_regions else seen
 
     def _reject_regions(self, votes: CSRRows, tick: Tick) -> tuple[CSRRows, dict[str, np.ndarray | None]]:
-        """Reject labels that the other views contradict: the votes without them; by view which they are, (L,) bool.
+        """Reject labels that the other views contradict; return the votes without them, and the labels by view.
 
-        What is rejected must not speak against others: so each is tested once more, by the votes that are left.
+        A rejected label may itself have contradicted others, so each one is tested again by the remaining votes. The
+        labels of a view are (L,) bool, or None if none is rejected.
         """
-        rejected: dict[str, np.ndarray | None] = dict.fromkeys(self.views)  # None where none is
+        rejected: dict[str, np.ndarray | None] = dict.fromkeys(self.views)
         if not self.settings.rejects_regions:
             return votes, rejected
-        # All neighbours of a scene are found once; while a GPU tests regions, the CPU is free for that.
+        # The neighbours of a scene are computed once; the CPU is free for it while a GPU tests regions.
         search, find = partial(find_neighbours, self.scene, self.settings.prior_k), EMLearner._find_rejected
         with meanwhile(search, self.device) if self.settings.prior_weight else nullcontext():
             change, doubted = self._over_views(find, rejected, tick, votes)
@@ -304,17 +306,17 @@ class EMLearner(Learner):
     def _over_views(
         self, work: Callable[..., OverViews], by_view: Mapping[str, Any], tick: Tick, *arrays: CSRRows | np.ndarray
     ) -> OverViews:
-        """Have a method below go over some views; these change nothing, so it may be done elsewhere, and again."""
+        """Call one of the methods below for some views. They change nothing, so workers may run and repeat them."""
         return work(self, *arrays, by_view, tick)
 
     def _find_rejected(
         self, votes: CSRRows, doubted: Mapping[str, np.ndarray | None], tick: Tick
     ) -> tuple[np.ndarray, dict[str, np.ndarray]]:
-        """Find the labels of some views that the other views contradict, by the votes of all, int64.
+        """Find the labels of some views that the votes of all other views contradict; `votes` are those of all, int64.
 
-        Of a view that is None among the `doubted`, all labels are tested; else those marked, (L,) bool, whose votes are
-        not among the votes. Returns what is left of zero votes, (Z,) int64 for each entry of the votes, when those that
-        are found are taken from it, and which they are, (L,) bool by view; views without any are left out.
+        `doubted` has the views to test: None to test all labels of a view, else a mask (L,) bool of the labels to test,
+        whose votes are not part of `votes`. Returns the change of each entry of `votes` that removes the rejected
+        labels, (Z,) int64, and the rejected labels by view, (L,) bool, for views that have any.
         """
         possible, device = self._possible(), self._device_of(votes)
         votes, backend = rows_on(votes, device)
@@ -331,15 +333,15 @@ class EMLearner(Learner):
         return backend.returned(change), rejected
 
     def _device_of(self, votes: CSRRows) -> str:
-        """Device that counts votes: those against a class are resolved on the CPU alone."""
+        """Return the device that counts votes; only the CPU code resolves votes against classes."""
         return "cpu" if votes.data.min(initial=0) < 0 else self.device
 
     def _initial_error_models(
         self, votes: CSRRows, rejected: Mapping[str, np.ndarray | None], tick: Tick
     ) -> tuple[None, dict[str, ErrorModel]]:
-        """Estimate an error model for each of some views from the votes of all other views.
+        """Estimate the error model of each of some views from the votes of all other views.
 
-        The votes, int64, are without those of labels that are `rejected`: (L,) bool, None of views without any.
+        The votes, int64, exclude those of `rejected` labels: (L,) bool by view, None if a view has none.
         """
         settings, possible = self.settings, self._possible()
         votes, backend = rows_on(votes, self._device_of(votes))
@@ -358,7 +360,7 @@ class EMLearner(Learner):
     def _e_step(self, codes: CSRRows, models: dict[str, ErrorModel], tick: Tick) -> tuple[np.ndarray, dict[str, float]]:
         """Sum the gradient of the log-likelihood over the views of these models.
 
-        Returns it with respect to each entry of the codes, (Z,) int64 in units of `GRADIENT_UNIT`, and the
+        Returns the gradient with respect to each entry of the codes, (Z,) int64 in units of `GRADIENT_UNIT`, and the
         log-likelihood of each view's labels, in nats.
         """
         codes, backend = rows_on(codes, self.device)
@@ -376,7 +378,7 @@ class EMLearner(Learner):
     def _refit_error_models(
         self, codes: CSRRows, gradient: np.ndarray, prior: np.ndarray, models: Mapping[str, ErrorModel], tick: Tick
     ) -> tuple[None, dict[str, ErrorModel]]:
-        """Re-estimate the error models of some views, each from the step without its view; see `codes_without`."""
+        """Re-estimate the error models of some views, each from an M-step without its view; see `codes_without`."""
         codes, backend = rows_on(codes, self.device)
         gradient, prior = (backend.put(array, self.device) for array in (gradient, prior))
 
@@ -386,13 +388,13 @@ class EMLearner(Learner):
             shares = backend.shares(observation, without, backend.by_row(pairs), likelihood)
             counts = backend.confusion_counts(without, pairs, shares.pairs, self.num_classes, len(likelihood))
             counts[0] += shares.rest
-            # Only some pixels of each label were gone through: they count for all of them.
+            # The counts cover only some pixels of each label: scale them to all of its pixels.
             counts *= observation.areas / np.maximum(observation.weighted_areas, 1)
             return model.m_step(model.expected_counts(counts))
 
         return None, dict(self._of_each(refit, models, tick))
 
     def _spatial_prior(self, of: CSRRows, evidence: np.ndarray) -> CSRRows:
-        """Prior of all Gaussians, by the votes or the probabilities of their neighbours, and their evidence in px."""
+        """Compute the spatial prior of all Gaussians from votes or probabilities, and their evidence in px."""
         settings = self.settings
         return spatial_prior(of, evidence, self.scene, settings.prior_k, settings.prior_weight, self.num_classes)

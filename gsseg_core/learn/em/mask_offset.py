@@ -1,8 +1,8 @@
-"""Mask offset: how far a mask as a whole lies beside its image, since its pose is off or it is of another moment.
+"""Mask offset: how far a whole mask is shifted in its image because of a wrong pose or time stamp.
 
-A camera turned by half a degree shows everything a few px away from where its mask has it. All boundaries of such a
-mask meet edges of the scene once it is moved by as much, so of all offsets the one is found at which they meet the
-strongest. Whether it is believed is for `gsseg_core.learn.em.boundary_alignment` to say.
+If a camera is rotated by half a degree, its mask is a few px away from the rendered scene. Moving the mask back makes
+all of its boundaries meet edges of the scene. So the search returns the offset at which the boundaries meet the
+strongest edges. `gsseg_core.learn.em.boundary_alignment` decides whether to apply it.
 """
 
 from __future__ import annotations
@@ -15,26 +15,26 @@ from gsseg_core.kernels.compiler import kernel
 
 FARTHEST = 8  # rows or columns
 
-LOG_OFFSETS = 2 * np.log(2 * FARTHEST + 1)  # nats: log of how many offsets there are, all as likely
+LOG_OFFSETS = 2 * np.log(2 * FARTHEST + 1)  # nats: log of the number of offsets, which are equally likely
 
 
 def likeliest_offset(
-    pixels: np.ndarray,  # (P,) int64: along the boundaries, counted row by row
-    weights: np.ndarray,  # (P,) float64: what edges of one unit are worth in each of them, in nats
+    pixels: np.ndarray,  # (P,) int64: pixels along the boundaries, as flat indices (row-major)
+    weights: np.ndarray,  # (P,) float64: log-likelihood of an edge of strength 1 at each of these pixels, in nats
     edges: np.ndarray,  # (H, W) float32: strength of the scene's edges
 ) -> tuple[int, int]:
-    """Find by how many rows and columns to move a mask so that its boundaries meet the strongest edges."""
+    """Find the offset, in rows and columns, that moves the boundaries of a mask to the strongest edges."""
     width = edges.shape[1]
     strengths = _strengths(pixels // width, pixels % width, weights, edges)
     middle = strengths.size // 2
-    # Where several are as good, the mask stays.
+    # The mask stays if no offset is better.
     best = middle if strengths.flat[middle] == strengths.max() else int(strengths.argmax())
     rows, columns = divmod(best, 2 * FARTHEST + 1)
     return rows - FARTHEST, columns - FARTHEST
 
 
 def move_mask(labels: np.ndarray, offset: tuple[int, int]) -> np.ndarray:
-    """Move a mask (H, W) by so many rows and columns; what it says nothing of then is unknown."""
+    """Move a mask (H, W) by an offset in rows and columns; pixels that it no longer covers become unknown."""
     moved = np.full_like(labels, UNKNOWN)
     (to_y, from_y), (to_x, from_x) = map(_overlap, offset)
     moved[to_y, to_x] = labels[from_y, from_x]
@@ -42,15 +42,15 @@ def move_mask(labels: np.ndarray, offset: tuple[int, int]) -> np.ndarray:
 
 
 def _overlap(by: int) -> tuple[slice, slice]:
-    """Where what is moved comes to lie, and where it comes from."""
+    """Return the target and source slices along one axis for a move by `by` pixels."""
     return (slice(by, None), slice(None, -by or None)) if by >= 0 else (slice(None, by), slice(-by, None))
 
 
 @kernel(parallel=True)
 def _strengths(rows: np.ndarray, columns: np.ndarray, weights: np.ndarray, edges: np.ndarray) -> np.ndarray:
-    """Sum up weighed edges along boundaries moved by each offset, (2 FARTHEST + 1, 2 FARTHEST + 1) float64.
+    """Average the edges along the boundaries, weighted, for each offset: (2 FARTHEST + 1, 2 FARTHEST + 1) float64.
 
-    What would leave the image is left out, and the rest weighs as much more.
+    Pixels that an offset moves out of the image are left out of its average.
     """
     height, width = edges.shape
     sums = np.zeros((2 * FARTHEST + 1, 2 * FARTHEST + 1))

@@ -1,4 +1,4 @@
-"""The kernels of EM by device: those that go through the (Gaussian, label) pairs of a view, where the pairs are."""
+"""Selects the EM kernels for a device; they process the (Gaussian, label) pairs of a view where these are stored."""
 
 from __future__ import annotations
 
@@ -14,12 +14,12 @@ from gsseg_core.raster.observation import Observation
 
 
 def kernels_on(device: str) -> ModuleType:
-    """Return the module whose functions work on a device: `em_kernels`, or its like for a GPU."""
+    """Return the module with the kernels for a device: `em_kernels` for the CPU, `em_gpu_kernels` for a GPU."""
     return importlib.import_module(f"gsseg_core.learn.em.{'em_kernels' if device == 'cpu' else 'em_gpu_kernels'}")
 
 
 def rows_on(rows: CSRRows, device: str) -> tuple[Any, ModuleType]:
-    """Copy rows to a device; second comes the module whose functions work on them there."""
+    """Return rows on a device, and the module with the kernels for it."""
     backend = kernels_on(device)
     return backend.put(rows, device), backend
 
@@ -28,10 +28,10 @@ def codes_without(
     observation: Observation, model: ErrorModel, codes: CSRRows, gradient: np.ndarray, prior: np.ndarray,
     device: str = "cpu",
 ) -> CSRRows:  # fmt: skip
-    """Take an M-step without one view: class probabilities of the M Gaussians that it sees, M rows.
+    """Take an M-step without one view: return class probabilities of the M Gaussians that it sees, M rows.
 
-    The gradient is that of all views at these codes and models; see `gsseg_core.learn.em.em_kernels` for the arrays,
-    which are on the device.
+    The gradient is that of all views at these codes and models. The arrays are on the device; see
+    `gsseg_core.learn.em.em_kernels` for their shapes.
     """
     backend = kernels_on(device)
     likelihood, pairs = model.by_label, backend.pairs_of(observation)

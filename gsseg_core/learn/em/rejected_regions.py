@@ -1,11 +1,12 @@
 """Rejected regions: connected pixels of one label that the votes of all other views contradict.
 
-Most errors of a segmenter sit in one place: a blob of clutter, an object under another's id, a whole bad frame. The
-confusion matrix of a view, the same all over it, does not model them. So each *region* of a mask, connected pixels of
-one label, is tested against the votes of all other views. Where they give enough of it to one class, and next to
-nothing to that of its label, the label is rejected. What is rejected has no say against others: each is tested once
-more, by the votes that are left. The pixels still belong together, so the region becomes a word of its own in the
-view's vocabulary, of which the confusion matrix tells what it means. docs/method.md has the reasons.
+Most errors of a segmenter are local: a blob of clutter, an object with the id of another one, or a whole bad frame. The
+confusion matrix of a view is the same for all pixels and does not model them. So each *region* of a mask, connected
+pixels of one label, is tested against the votes of all other views. Its label is rejected if these votes give enough of
+the region to one class and almost nothing to the class of the label. Since rejected labels may themselves have
+contradicted others, each one is tested again by the remaining votes. The pixels of a rejected region still belong
+together: the region becomes a new word of the view's vocabulary, and the confusion matrix learns which class it means.
+docs/method.md has the reasons.
 """
 
 from __future__ import annotations
@@ -20,19 +21,19 @@ from gsseg_core.kernels.compiler import called_by_kernels, kernel
 from gsseg_core.learn.em.pair_kernels import kernels_on
 from gsseg_core.raster.observation import Observation
 
-SMALLEST = 64  # regions of fewer px are not split: all of one label are tested as one
+SMALLEST = 64  # px; smaller regions of one label are tested together
 
 CLAIMED = 0.2
-"""Share of a region, by weight, that the other views must give to one class for it to be rejected."""
+"""Share of a region, by weight, that the other views must give to a single class before its label is rejected."""
 
 RIVALLED = 2.0
-"""Where one other class has a region by the votes of the other views, this many times the share is asked for."""
+"""Factor on the required share `least` when the label is compared with the strongest class of the other views."""
 
-MOST = 500  # regions of a mask that are split at most, the largest; what is left of each label is tested as one
+MOST = 500  # only this many of the largest regions of a mask are split; the rest of each label is tested together
 
 
 def split_regions(seen: SeenLabels) -> SeenLabels:
-    """Split a plain mask into regions, each a label of its own with evidence for the same class as before."""
+    """Split a plain mask into regions; each gets its own label, with evidence for the same class as before."""
     if seen.evidence is not None or not (seen.labels >= 0).any():
         return seen
     connected, first, area = connected_pixels(seen.labels)
@@ -41,7 +42,7 @@ def split_regions(seen: SeenLabels) -> SeenLabels:
     alone[np.argsort(-area, kind="stable")[:MOST]] = True
     alone &= area >= SMALLEST
     classes, position = np.unique(label, return_inverse=True)
-    # Those that stand alone keep a number each; the others have that of their class.
+    # Split regions get a number each; the others share the number of their class.
     regions = np.unique(np.where(alone, len(classes) + np.arange(len(area)), position), return_inverse=True)[1]
     mass = np.zeros((int(regions.max()) + 1, len(classes)), np.float32)
     mass[regions, position] = 1
@@ -53,15 +54,19 @@ def find_rejected(
     votes: CSRRows, observation: Observation, possible: np.ndarray, least: float, device: str = "cpu",
     doubted: np.ndarray | None = None,
 ) -> np.ndarray:  # fmt: skip
-    """Find the labels of a view that the votes of all other views contradict, (L,) bool; none of uncertain evidence.
+    """Find the labels of a view that the votes of all other views contradict, (L,) bool; none if evidence is uncertain.
 
-    By the votes of the others, each class has some weight under a label. The label is contradicted if its own class has
-    less than the share `least` of all that weight, or less than `RIVALLED` times `least` of what another class has: one
-    class all over speaks more against a label than an even mixture of many. A Gaussian counts for no more px than the
-    others saw of it: what shows through gaps in other views is little evidence, and of many classes. A region of which
-    they give too little to any one class is kept.
+    The votes of the other views give each class some weight under a label. They contradict the label if its own class
+    has less than
 
-    If there are `doubted` labels, (L,) bool, only they can be rejected, and their votes are not among the votes. The
+    - the share `least` of the weight of all classes, or
+    - `RIVALLED` times `least` of the weight of the strongest class. This share is larger because a single other class
+      is stronger evidence against a label than an even mixture of many.
+
+    A label is kept if no class has more than the share `CLAIMED` of the view's own votes for it. A Gaussian counts for
+    no more px than the other views saw of it, because what they see through gaps is weak evidence, of many classes.
+
+    If `doubted` labels are given, (L,) bool, only they can be rejected, and `votes` must not include their votes. The
     other parameters are those of `leave_one_out_counts`, with the votes on the device.
     """
     evidence = observation.evidence
@@ -78,13 +83,14 @@ def find_rejected(
 
 @kernel
 def connected_pixels(labels: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:  # (H, W) int32
-    """Label the 4-connected components of pixels of one label, in the order of their first pixels.
+    """Find the 4-connected components of equal labels, numbered in the order of their first pixels.
 
-    Returns the components, (H, W) int32, `UNKNOWN` (-1) where the label is negative; and of each its first pixel,
-    counted row by row, and how many it has, (R,) int64 each. Runs of equal pixels are joined to those of the row above.
+    Returns the component of each pixel, (H, W) int32, `UNKNOWN` (-1) where the label is negative; and for each
+    component its first pixel, as a flat index (row-major), and its number of pixels, (R,) int64 each. Runs of equal
+    pixels are joined to runs of the row above.
     """
     (height, width), connected = labels.shape, np.empty(labels.shape, np.int32)
-    # Of runs; there are at most as many as pixels.
+    # One entry per run; there are at most as many runs as pixels.
     parent, begin, runs = np.empty(labels.size, np.int32), np.empty(labels.size, np.int32), 0
     for y in range(height):
         for x in range(width):
@@ -96,7 +102,7 @@ def connected_pixels(labels: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.nda
                 parent[runs], begin[runs] = runs, y * width + x
                 runs += 1
             connected[y, x] = run = runs - 1
-            # Once for each stretch in which the two rows go along with each other.
+            # Join once per stretch of columns in which both rows have this label.
             if y > 0 and labels[y, x] == labels[y - 1, x] and not (joined and labels[y - 1, x - 1] == labels[y, x]):
                 one, two = _root(parent, run), _root(parent, connected[y - 1, x])
                 parent[max(one, two)] = min(one, two)

@@ -1,9 +1,9 @@
-"""Edges of the scene in a view, of colour and of depth, to which boundaries of masks can be aligned.
+"""Edges of colour and depth of the scene in a view, for the alignment of mask boundaries.
 
-Their strength is the gradient of the luminance plus the second differences of the inverse depth, each in units of its
-95th percentile, which is that of a sample of the view. Edges are rendered where they are needed alone: near boundaries
-of the mask, and in the sample. On a plane, inverse depth is linear in the image, so that its second differences are
-those of creases and steps. Depth alone is too blurred to locate boundaries: a scene of one colour has no edges.
+The strength of an edge is the luminance gradient plus the second differences of inverse depth, each in units of its
+95th percentile in a sample of the view. Only the pixels near boundaries of the mask and those in the sample are
+rendered. Inverse depth is linear in the image on a plane, so its second differences respond to creases and steps only.
+Depth alone is too blurred to locate boundaries, so a scene of one colour has no edges.
 """
 
 from __future__ import annotations
@@ -19,15 +19,15 @@ from gsseg_core.scene.gaussian_scene import GaussianScene
 from gsseg_core.scene.scene_cache import PerScene
 
 SQUARE = 4 * BLOCK  # px, side of the squares of the sample, which are tiles of the rasteriser
-EVERY = 3  # of rows and columns of squares, one is in the sample
-SMALL = 448  # px: of rows or columns of fewer, all are in the sample
-STRONGEST = 2.0  # edges count at most so much, in units of the view's 95th percentile
+EVERY = 3  # the sample takes every third row and column of squares
+SMALL = 448  # px; an image with fewer rows or columns is sampled in all of them
+STRONGEST = 2.0  # edge strengths are clipped to this many 95th percentiles of the view
 
 _LIGHT: PerScene[tuple[np.ndarray, bool]] = PerScene()
 
 
 def luminance(scene: GaussianScene) -> tuple[np.ndarray, bool]:
-    """Mean of the channels of each Gaussian's colour, (N,) float32, and whether any differ: else nothing has edges."""
+    """Return each Gaussian's mean colour channel, (N,) float32, and whether any differ; if not, there are no edges."""
 
     def measured() -> tuple[np.ndarray, bool]:
         light = scene.colors().mean(axis=1)
@@ -37,9 +37,10 @@ def luminance(scene: GaussianScene) -> tuple[np.ndarray, bool]:
 
 
 def scene_edges(operator: ViewOperator, scene: GaussianScene, labels: np.ndarray, distance: int) -> np.ndarray:
-    """Strength of the edges of colour and depth of a view, (H, W) float32, at least 0; see above for units.
+    """Compute the strength of the edges of a view, (H, W) float32, at least 0, in the units of this module.
 
-    It has no meaning farther than so many px from the boundaries of the view's mask, (H, W) int32, but in the sample.
+    Values are only valid within `distance` px of the boundaries of the view's mask `labels`, (H, W) int32, and in the
+    sample.
     """
     camera, (light, differs) = operator.camera, luminance(scene)
     if not differs:
@@ -59,23 +60,23 @@ def _in_units(edges: np.ndarray) -> np.ndarray:
 
 
 def rank_of_unit(count: int) -> int:
-    """Tell which of so many edges, sorted, is the unit."""
+    """Return the index of the unit, the 95th percentile, among `count` sorted edges."""
     return 95 * (count - 1) // 100
 
 
 def sampled(image: np.ndarray) -> np.ndarray:
-    """Sample a view, (H, W): the pixels of some squares, but for their margins; all pixels of a small one."""
+    """Return the sampled pixels of an image, (H, W): some squares without their margins, or all of a small image."""
     rows, columns = rows_and_columns_in_sample(*image.shape)
     return image[rows][:, columns].ravel()
 
 
 def rows_and_columns_in_sample(height: int, width: int) -> tuple[np.ndarray, np.ndarray]:
-    """Mark those that `sampled` takes, (H,) and (W,) bool."""
+    """Mark the rows and columns that `sampled` uses, (H,) and (W,) bool."""
     return _in_sample(height, 1), _in_sample(width, 1)
 
 
 def _in_sample(size: int, margin: int) -> np.ndarray:
-    """Mark the rows or columns of an image that meet squares of the sample, less their margins: (size,) bool."""
+    """Mark the rows or columns of an image that cross squares of the sample, without margins: (size,) bool."""
     if size < SMALL:
         return np.ones(size, bool)
     first = np.arange(size) % (SQUARE * EVERY) - SQUARE
@@ -83,7 +84,7 @@ def _in_sample(size: int, margin: int) -> np.ndarray:
 
 
 def _near_or_sampled(near: np.ndarray, height: int, width: int) -> np.ndarray:
-    """Mark the pixels of blocks that are near, and of the squares of the sample, (H, W) bool."""
+    """Mark the pixels of blocks `near` boundaries and of the squares of the sample, (H, W) bool."""
     wanted: np.ndarray = near.repeat(BLOCK, axis=0).repeat(BLOCK, axis=1)[:height, :width]
     wanted |= np.logical_and.outer(_in_sample(height, 0), _in_sample(width, 0))
     return wanted
@@ -93,27 +94,28 @@ def _near_or_sampled(near: np.ndarray, height: int, width: int) -> np.ndarray:
 def _luminance_and_inverse_depth(
     means: np.ndarray, light: np.ndarray, ids: np.ndarray, ahead: np.ndarray  # (N, 3), (N,), (M,), (4,) row of depths
 ) -> np.ndarray:  # fmt: skip
-    """Luminance and inverse depth of some Gaussians, (M, 2) float32."""
+    """Return luminance and inverse depth of some Gaussians, (M, 2) float32."""
     channels = np.empty((ids.shape[0], 2), np.float32)
     for m in nb.prange(ids.shape[0]):
         i = ids[m]
         depth = means[i, 0] * ahead[0] + means[i, 1] * ahead[1] + means[i, 2] * ahead[2] + ahead[3]
         channels[m, 0] = light[i]
-        channels[m, 1] = 1 / max(depth, np.float32(1e-6))  # what is behind the camera is not drawn
+        channels[m, 1] = 1 / max(depth, np.float32(1e-6))  # Gaussians behind the camera are not rendered
     return channels
 
 
 @kernel(parallel=True)
 def _differences(image: np.ndarray, left_over: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Length of the gradient of luminance, and second differences of inverse depth, (H, W) float32 each.
+    """Return the length of the luminance gradient and the second differences of inverse depth, (H, W) float32 each.
 
-    The image (H, W, 2) holds the two; it is divided in place by what of each ray is not left over, (H, W).
+    `image`, (H, W, 2), has luminance and inverse depth. It is divided in place by the accumulated opacity of each ray,
+    1 - `left_over`, (H, W), but at least by 0.5.
     """
     height, width = left_over.shape
     light_edges, depth_edges = np.empty((height, width), np.float32), np.empty((height, width), np.float32)
     for y in nb.prange(height):
         for x in range(width):
-            # Means over what is seen; where that is little, the background is dark and far away.
+            # Mean over the visible Gaussians; where a ray mostly misses them, the background counts as dark and far.
             seen = max(1 - left_over[y, x], np.float32(0.5))
             image[y, x, 0] /= seen
             image[y, x, 1] /= seen

@@ -1,10 +1,10 @@
-"""Spatial prior of EM: objects are continuous in space, so a Gaussian is likely what its nearest neighbours are.
+"""Spatial prior of EM: objects are continuous in space, so a Gaussian likely has the class of its nearest neighbours.
 
-At first the votes say what the neighbours are. Votes of partial masks say it badly, since each of these votes against
-the classes that it looked for and does not show. Where one mask misses an object that few others looked for, the right
-class may get more votes against it than for it. It is then dropped, for the Gaussian and its neighbours alike, and
-stays at zero in every step. Once EM has all but converged, its probabilities are the better source, and the prior is
-taken from them: a class that some of the neighbours have kept then comes back to the others.
+At first, the classes of the neighbours come from the votes. Partial masks make these less reliable, since a partial
+mask votes against each class that its segmenter looked for and did not find. If one mask misses an object that few
+others looked for, the right class may get more votes against it than for it. It is then dropped for the Gaussian and
+its neighbours alike, and stays at zero in every step. Once EM has almost converged, its probabilities are more
+reliable. The prior is then computed from them, and a class that some neighbours have kept returns to the others.
 """
 
 from __future__ import annotations
@@ -17,14 +17,17 @@ from gsseg_core.spatial.neighbourhood import neighbour_weights, neighbours_of
 
 
 def spatial_prior(
-    shares: CSRRows,  # N rows of each class, in any unit: votes of at least 0, or probabilities
-    evidence: np.ndarray,  # (N,): by how many px each was seen, 0 where it was not
+    shares: CSRRows,  # N rows: votes of at least 0, in any unit, or probabilities, by class
+    evidence: np.ndarray,  # (N,): px that saw each Gaussian, 0 if it was not seen
     scene: GaussianScene,
     k: int,
     weight: float,
     num_classes: int,
 ) -> CSRRows:
-    """Mean probabilities of the k nearest Gaussians, better seen ones the more, times a weight; empty if none was."""
+    """Average the probabilities of the k nearest Gaussians, weighted by evidence, and multiply by `weight`.
+
+    A row is empty if none of its neighbours was seen.
+    """
     neighbours = neighbours_of(scene, k) if weight else None
     if neighbours is None:
         return CSRRows.empty(shares.num_rows, np.float32)
@@ -34,9 +37,9 @@ def spatial_prior(
 
 
 def with_prior(codes: CSRRows, gradient: np.ndarray, prior: CSRRows) -> tuple[CSRRows, np.ndarray, CSRRows]:
-    """Give codes and their gradient, (Z,), another prior; all three then have the classes that either had.
+    """Combine codes and their gradient, (Z,), with a new prior; all three then have the classes of both.
 
-    Entries that are new are zero. The next M-step adds the prior to them, and from then on they count.
+    New entries of codes and gradient are zero. They become positive in the next M-step, which adds the prior.
     """
     gradient = codes.with_data(gradient).united(prior)[0].data
     codes, prior = codes.united(prior)
