@@ -1,7 +1,7 @@
-"""How well predicted label maps agree with true ones: IoU, accuracy and boundary IoU, accumulated over views.
+"""Measures how well predicted label maps agree with the truth: IoU, accuracy and boundary IoU over all views.
 
-All figures are ratios of pixel counts summed over every view that was added, never means of per-view figures, so a
-class that is a speck in one view and fills another is weighed by what was seen of it.
+All figures are ratios of pixel counts that are summed over all views, never means of per-view figures. So a class that
+is small in one view and fills another has the weight of its pixels in each.
 """
 
 from __future__ import annotations
@@ -24,15 +24,15 @@ from gsseg_core.files.run_folder import settle
 from gsseg_core.scene.camera import Camera
 
 _SOME_VIEWS = "; to score a few views, name them as test in split.json, and render these"
-BOUNDARY_SHARE = 0.02  # of the image diagonal: width of the boundary band (Cheng et al., Boundary IoU, CVPR 2021)
+BOUNDARY_SHARE = 0.02  # width of the boundary band / image diagonal (Cheng et al., Boundary IoU, CVPR 2021)
 
 
 class Evaluation:
     """Agreement of predicted label maps with the truth, accumulated view by view.
 
-    Labels are integers from 0; K is the largest one seen so far plus one, and grows by itself. Pixels whose truth is
-    `UNKNOWN` are ignored altogether; a prediction that is `UNKNOWN` where the truth is known is a false negative of
-    the true class, and a false positive of none.
+    Labels are integers from 0; K is the largest label so far plus one, and grows when needed. Pixels whose truth is
+    `UNKNOWN` are ignored. If only the prediction is `UNKNOWN`, the pixel is a false negative of the true class, and a
+    false positive of no class.
 
     Examples
     --------
@@ -52,12 +52,12 @@ class Evaluation:
         self._band = np.zeros((3, 0), np.int64)  # the same, of boundary bands
 
     def add(self, truth: np.ndarray, prediction: np.ndarray, name: str = "view") -> None:  # both (H, W)
-        """Add label maps of one view, integers that are `UNKNOWN` where there is no label.
+        """Add the label maps of one view: integers, `UNKNOWN` where a pixel has no label.
 
         Raises
         ------
         MaskFormatError, MaskSizeError
-            The two hold what is no label, or differ in size; the message calls the view `name`.
+            A map has invalid labels, or the two differ in size; the message calls the view `name`.
         """
         if truth.shape != prediction.shape or truth.ndim != 2:
             raise MaskSizeError(
@@ -70,12 +70,12 @@ class Evaluation:
                 found = f"{labels.dtype} {ends[0]} to {ends[1]}" if ends else labels.dtype
                 raise MaskFormatError(f"{name}: found {found}; expected integers {UNKNOWN} to {MAX_LABEL}")
         known = truth != UNKNOWN
-        # What nobody knows is taken as predicted, so that no boundary of the truth runs along the unknown.
+        # Fill unknown truth with the prediction, so that the truth has no boundary along unknown pixels.
         truth, prediction = np.where(known, truth, prediction).astype(np.int32), prediction.astype(np.int32)
         answered = known & (prediction != UNKNOWN)
         size = max(self.num_classes, int(truth.max(initial=-1)) + 1, int(prediction.max(initial=-1)) + 1)
 
-        # As int64: of two int32, NumPy 1 makes an int32, and the square of the largest label does not fit.
+        # As int64: NumPy 1 multiplies int32 as int32, which overflows for the square of the largest label.
         pairs, counts = np.unique(truth[answered].astype(np.int64) * size + prediction[answered], return_counts=True)
         for pair, count in zip(pairs.tolist(), counts.tolist(), strict=True):
             self._pairs[divmod(pair, size)] += count
@@ -93,7 +93,7 @@ class Evaluation:
 
     @property
     def confusion(self) -> np.ndarray:
-        """(K, K) int64, pixels by true label (row) and predicted label (column)."""
+        """Confusion matrix, (K, K) int64: pixels by true label (row) and predicted label (column)."""
         matrix = np.zeros((self.num_classes, self.num_classes), np.int64)
         for pair, count in self._pairs.items():
             matrix[pair] = count
@@ -101,17 +101,17 @@ class Evaluation:
 
     @property
     def iou(self) -> np.ndarray:
-        """(K,) float64, intersection over union of each class; NaN for a class in neither truth nor prediction."""
+        """Intersection over union of each class, (K,) float64; NaN for a class in neither truth nor prediction."""
         return iou(*self._area)
 
     @property
     def accuracy(self) -> np.ndarray:
-        """(K,) float64, share of each true class's pixels that were predicted right; NaN where the truth has none."""
+        """Share of each true class's pixels that are predicted correctly, (K,) float64; NaN if the truth has none."""
         return _ratio(self._area[0], self._area[1])
 
     @property
     def boundary_iou(self) -> np.ndarray:
-        """(K,) float64, IoU of each class's boundary band: its pixels nearer to its edge than 2 % of the diagonal."""
+        """IoU of each class's boundary band, (K,) float64: its pixels nearer to its edge than 2 % of the diagonal."""
         return iou(*self._band)
 
     @property
@@ -131,7 +131,7 @@ class Evaluation:
 
     @property
     def other_ids(self) -> dict[int, int]:
-        """Id that predictions give most of a true object, where that is another object's; none if most ids agree."""
+        """Map true objects to the different object id that most of their pixels get; empty if most objects agree."""
         most: dict[int, tuple[int, int]] = {}
         for (truth, found), count in self._pairs.items():
             if truth:
@@ -140,12 +140,12 @@ class Evaluation:
         return others if 2 * len(others) > len(most) else {}
 
     def as_dict(self, class_names: Mapping[int, str] | None = None) -> dict[str, Any]:
-        """Everything as plain numbers for JSON; what is undefined is None.
+        """Return all figures as plain numbers for JSON; undefined ones are None.
 
         Parameters
         ----------
         class_names : mapping from label to name, optional
-            Where it lacks one, the name is "class_07" or the like.
+            A class without a name is called "class_07" or the like.
 
         Returns
         -------
@@ -168,18 +168,19 @@ class Evaluation:
 
 
 def iou(both: np.ndarray, first: np.ndarray, second: np.ndarray) -> np.ndarray:
-    """Intersection over union of what is counted in both, in the first and in the second; NaN where neither has any."""
+    """Compute intersection over union from counts in both, in the first and in the second; NaN where both are empty."""
     return _ratio(both, first + second - both)
 
 
 def boundary_band(labels: np.ndarray, width: int) -> np.ndarray:  # (H, W) of a signed type; pixels
-    """Find the pixels on the inner boundary of their own class, of all classes at once: (H, W) bool.
+    """Mark the pixels on the inner boundary of their own class, for all classes at once: (H, W) bool.
 
-    A pixel is in the band of its class c unless all pixels up to `width` rows and columns away are c; what lies
-    outside the image is no class. For each class this is the mask minus its erosion by `width` steps of a 3x3 square,
-    as boundary IoU defines it. A square is all one label exactly where its smallest and largest label are the same.
+    A pixel of class c is in the band of c unless all pixels up to `width` rows and columns away are c; pixels outside
+    the image have no class. For each class this is the mask minus its erosion by `width` steps of a 3x3 square, as
+    boundary IoU defines it. The code uses that a square has only one label exactly if its smallest and largest label
+    are equal.
     """
-    from scipy import ndimage  # Only where it is used: a node measures nothing.
+    from scipy import ndimage  # Imported here because a ROS node, which measures nothing, does not need it.
 
     size = 2 * width + 1
     lowest = ndimage.minimum_filter(labels, size, mode="constant", cval=UNKNOWN - 1)
@@ -190,15 +191,15 @@ def boundary_band(labels: np.ndarray, width: int) -> np.ndarray:  # (H, W) of a 
 def evaluate_folders(pred_dir: str | Path, truth_dir: str | Path, cameras: Iterable[Camera] = ()) -> Evaluation:
     """Compare every `<stem>.png` in one folder of label images with the mask of the same view in another.
 
-    Truth without a prediction is ignored, since a folder of true masks holds the train views too. With `cameras`, truth
-    of another size than its prediction's is read as masks to learn from are: undistorted where a lens bent the image,
-    and scaled to its size.
+    True masks without a prediction are ignored, since their folder also has those of the train views. With `cameras`, a
+    true mask is undistorted if its camera has lens distortion, and scaled if its size is not that of the prediction, as
+    masks for learning are.
 
-    Raises `NoUsableViewsError` where there is no PNG in `pred_dir`, `MaskFormatError` where a prediction has no truth
-    or a file is no label image, and `MaskSizeError` where a prediction and its truth differ in size.
+    Raises `NoUsableViewsError` if `pred_dir` has no PNG, `MaskFormatError` if a prediction has no truth or a file is no
+    label image, and `MaskSizeError` if a prediction and its truth differ in size.
     """
     pred_dir, truth_dir, predictions = Path(pred_dir), Path(truth_dir), predicted_maps(pred_dir)
-    from gsseg_core.data.mask_files import masks_below  # They load numba, which is of no use to anybody else here.
+    from gsseg_core.data.mask_files import masks_below  # These imports load numba, which the rest does not need.
     from gsseg_core.data.mask_formats.place import Place
     from gsseg_core.data.view import View
 
@@ -224,10 +225,10 @@ def evaluate_folders(pred_dir: str | Path, truth_dir: str | Path, cameras: Itera
 
 
 def evaluate_masks(pred_dir: str | Path, masks: MaskSet, cameras: Iterable[Camera] = ()) -> Evaluation:
-    """Compare every `<stem>.png` in a folder of label images with the mask of this view that another program wrote.
+    """Compare every `<stem>.png` in a folder of label images with the mask of the same view from another program.
 
-    A view without a camera among `cameras` has an image of the size of its prediction. Raises as `evaluate_folders`
-    does, and `MaskFormatError` where a mask cannot be read.
+    A view without a camera in `cameras` is taken to have an image of the size of its prediction. Raises as
+    `evaluate_folders` does, and `MaskFormatError` if a mask cannot be read.
     """
     from gsseg_core.data.view import View
 
@@ -245,7 +246,7 @@ def evaluate_masks(pred_dir: str | Path, masks: MaskSet, cameras: Iterable[Camer
 
 
 def predicted_maps(folder: str | Path) -> list[Path]:
-    """List the label maps `<stem>.png` that `gsseg render` or the like wrote, or raise `NoUsableViewsError`."""
+    """List the label maps `<stem>.png` in a folder, as `gsseg render` writes them; `NoUsableViewsError` if none."""
     settle(Path(folder))
     predictions = [path for path in list_folder(Path(folder), NoUsableViewsError, None) if path.suffix == ".png"]
     if not predictions:
@@ -256,7 +257,7 @@ def predicted_maps(folder: str | Path) -> list[Path]:
 def _count(
     truth: np.ndarray, prediction: np.ndarray, in_truth: np.ndarray, in_prediction: np.ndarray, size: int
 ) -> np.ndarray:  # of (H, W)
-    """(3, size), pixels per class that count in both, in the truth, in the prediction."""
+    """Count the pixels per class in both, in the truth and in the prediction, (3, size)."""
     in_both = in_truth & in_prediction & (truth == prediction)
     chosen = truth[in_both], truth[in_truth], prediction[in_prediction]
     return np.stack([np.bincount(labels, minlength=size) for labels in chosen])

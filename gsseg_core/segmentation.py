@@ -36,14 +36,14 @@ from gsseg_core.spatial.row_order import inverse
 from gsseg_core.text import clipped
 
 T = TypeVar("T")
-_FIRST_ONE = threading.Lock()  # of several threads that ask for what is blended, one computes it
+_FIRST_ONE = threading.Lock()  # lets only one of several threads compute the codes to blend
 
 
 class RenderedLabels(NamedTuple):
-    """What a rendered view shows in every pixel."""
+    """Class and confidence of every pixel of a rendered view."""
 
-    labels: np.ndarray  # (H, W) int32: ids of classes
-    confidence: np.ndarray  # (H, W) float32: their probability; once calibrated, the share of pixels so sure as right
+    labels: np.ndarray  # (H, W) int32: class ids
+    confidence: np.ndarray  # (H, W) float32: class probability; if calibrated, the share of such pixels that are right
 
 
 @dataclass(frozen=True, eq=False)
@@ -55,23 +55,23 @@ class Segmentation:
     labels : (N,) int32
         Class id, or `UNOBSERVED` (-1), or `REMOVED` (-2).
     shares : CSRRows
-        Class probabilities (N, K) float32, as `probabilities` writes them out; of hundreds of classes, a Gaussian has a
-        few. Rows sum to 1; none has entries where unobserved. Removed Gaussians keep theirs. Once calibrated, they mean
-        what they say. Columns are the classes in the order of `class_names`: column k is class k, unless ids have gaps.
+        Class probabilities (N, K) float32; `probabilities` is the dense array. A Gaussian has entries for only a few of
+        hundreds of classes. Rows sum to 1; rows of unobserved Gaussians are empty. Removed Gaussians keep their rows.
+        Columns are in the order of `class_names`: column k is class k, unless ids have gaps.
     class_names : dict of int to str
         Names by class id, ascending, one for each of the K columns.
     scene_digest : str
-        Which scene it belongs to.
+        Digest of the scene to which the segmentation belongs.
     clustered : (N,) bool
         Gaussians whose probabilities came from their neighbours.
     learnt : CSRRows
-        What these had learnt themselves, (C, K) float32, in the order of the scene. Not calibrated.
+        Probabilities that the `clustered` Gaussians had before, (C, K) float32, in scene order; never calibrated.
     temperature : float
-        At which the probabilities are; 1 where they are those that blend, as they were learnt.
+        Temperature of the probabilities, see `calibrated`; 1 if they are as they were learnt.
     ids : (N,) int64 or None
-        Ids of the Gaussians that stay while the scene changes, if it has any; see docs/living_map.md.
+        Gaussian ids that persist while the scene changes, if it has any; see docs/living_map.md.
     tree : ObjectTree or None
-        Parts and wholes of the classes, where these are objects that were found from ids of each view's own.
+        Parts and wholes of the classes, if the classes are objects that were found from per-view ids.
     """
 
     labels: np.ndarray
@@ -100,16 +100,16 @@ class Segmentation:
         scene : GaussianScene
             N Gaussians.
         codes : (N, K) float32
-            Class probabilities, which sum to 1; a row of zeros where nothing is known. Other values raise
-            `SettingsError`, and another N `StateMismatchError`.
+            Class probabilities; each row sums to 1, or is zero if nothing is known. Other values raise `SettingsError`,
+            another N raises `StateMismatchError`.
         class_names : mapping from id to name
-            Classes without a name get one like "class_07". Ids that are not 0 to K - 1 raise `SettingsError`, and so do
-            names that are not one line of text.
+            Classes without a name get one like "class_07". Ids outside 0 to K - 1 and names that are not one line of
+            text raise `SettingsError`.
         settings : RefineSettings, optional
-            Without the filter by default. What needs views is left to `carved`.
+            By default without the filter. Carving needs views: call `carved` for it.
         evidence : (N,) float32, optional
-            Weight of the pixels that each code was learnt from, in px, finite and at least 0: `Learner.evidence`.
-            Neighbours weigh by it; without, all weigh the same. Raises as codes do.
+            Weight of the pixels that each code was learnt from, in px, finite and at least 0: `Learner.evidence`. It
+            weights the neighbours; without it, all have equal weight. Raises the same errors as `codes`.
         """
         settings = settings or RefineSettings()
         codes, n = np.asarray(codes, np.float32), len(scene)
@@ -130,43 +130,43 @@ class Segmentation:
         cls, scene: GaussianScene, codes: CSRRows, class_names: Mapping[int, str], settings: RefineSettings,
         evidence: np.ndarray | None = None,
     ) -> Segmentation:  # fmt: skip
-        """Do what `from_codes` does with a learner's codes and names of all K classes; the filter is left out."""
+        """Do what `from_codes` does, but without the filter, from a learner's codes and the names of all K classes."""
         refined, clustered = codes, np.zeros(len(scene), bool)
         if settings.cluster:
             px, neighbours = evidence if settings.weigh else None, neighbours_of(scene, settings.k)
             refined, clustered = cluster(neighbours, codes, len(class_names), settings.beta, px)
-        _, labels = largest(refined)  # -1, which is UNOBSERVED, where nothing is known
+        _, labels = largest(refined)  # -1, which is UNOBSERVED, for empty rows
         learnt = codes.take(np.flatnonzero(clustered))
         return cls(labels, refined, dict(class_names), scene.digest, clustered, learnt, ids=scene.ids)
 
     def require(self, scene: GaussianScene) -> None:
-        """Raise `StateMismatchError` unless this is a segmentation of a scene: its indices are of no other."""
+        """Raise `StateMismatchError` if this segmentation belongs to another scene."""
         if self.scene_digest != scene.digest:
             found, given = self.scene_digest[:12], scene.digest[:12]
             raise StateMismatchError(f"segmentation: belongs to the scene {found}; expected {given}, the one given")
 
     def filtered(self, scene: GaussianScene, settings: RefineSettings) -> Segmentation:
-        """Take the outliers out of each object, if asked for: the paper's statistical filter. Raises as `carved`."""
+        """Remove outliers of each object by the paper's statistical filter if `settings.filter`; raises as `carved`."""
         self.require(scene)
         if not settings.filter:
             return self
         return self._without(statistical_filter(neighbours_of(scene, settings.k), self.labels, settings.filter_sigmas))
 
     def calibrated(self, temperature: float) -> Segmentation:
-        """Bring all probabilities to a temperature, as `gsseg_core.learn.calibrate` fits it; labels and pictures stay.
+        """Apply a temperature from `gsseg_core.learn.calibrate` to all probabilities; labels and pictures don't change.
 
-        What blends into a view are always the shares that were learnt; a pixel's probability is what they blend to, at
-        this temperature, from 0.001 to 1000, as files hold it; else `SettingsError`.
+        Views always blend the shares as they were learnt, and apply the temperature to the blended pixel. Raises
+        `SettingsError` for a temperature outside 0.001 to 1000, the range that files can hold.
         """
         temperature = check_temperature(temperature, SettingsError)
         change = temperature / self.temperature
         return replace(self, shares=tempered_rows(self.shares, change), temperature=temperature)
 
     def at(self, granularity: float | None) -> Segmentation:
-        """Cut the tree: the segmentation whose classes are its nodes at a granularity; where that is None, the objects.
+        """Cut the tree at a granularity: return a segmentation whose classes are the nodes there; None: the objects.
 
-        What is an object there keeps its id and name. What a Gaussian has of its own object goes to its own part, what
-        it has of another to the largest part of that.
+        Nodes that are objects keep their ids and names. A Gaussian's share of its own object goes to its own part; its
+        share of another object goes to the largest part of that object.
 
         Raises
         ------
@@ -178,7 +178,7 @@ class Segmentation:
         if (tree := self.tree) is None:
             raise SettingsError("granularity needs objects that were found from ids of each view's own; found no tree")
         names = tree.names(self.class_names)
-        # What blends into a view of a whole is the sum of what its objects do, as it was learnt.
+        # A whole blends as the sum of its objects, so sum the probabilities as they were learnt, at temperature 1.
         shares, nodes = tree.shares_at(granularity, self.calibrated(1.0).shares, tree.leaves)
         return replace(
             self, labels=tree.labels_at(granularity, self.labels), shares=shares,
@@ -188,23 +188,23 @@ class Segmentation:
 
     @property
     def node_names(self) -> dict[int, str]:
-        """Names of the classes by id, and of the parts and wholes of the tree, if there is one."""
+        """Names by id of the classes, and of the parts and wholes of the tree if there is one."""
         return self.class_names if self.tree is None else self.tree.names(self.class_names)
 
     def members(self, node: int) -> np.ndarray:
-        """Tell which Gaussians belong to a class, or to a part or whole by its id in the tree, (N,) bool."""
+        """Mark the Gaussians of a class, or of a part or whole by its id in the tree, (N,) bool."""
         if self.tree is None or node < self.tree.num_classes:
             return np.asarray(self.labels == node)
         return np.isin(self.tree.labels_at(1.0, self.labels), [node, *self.tree.inside(node)])
 
     def selected(self, classes: Collection[int], min_confidence: float = 0.0) -> Segmentation:
-        """Keep the labels of some classes, and there only of Gaussians at least so sure; the others are removed."""
+        """Keep the labels of some classes for Gaussians of at least `min_confidence`; other labels become `REMOVED`."""
         kept = np.isin(self.labels, list(classes)) & (self.confidence >= min_confidence)
         return self._without(~kept & (self.labels >= 0))
 
     @property
     def class_ids(self) -> np.ndarray:
-        """Id of the class of each column, (K,) int32 ascending; the first is 0, the background."""
+        """Class id of each column, (K,) int32 ascending; the first is 0, the background."""
         return np.fromiter(self.class_names, np.int32)
 
     @property
@@ -216,14 +216,14 @@ class Segmentation:
         return replace(self, labels=np.where(out, np.int32(REMOVED), self.labels))
 
     def numbered(self) -> Segmentation:
-        """Give the classes numbers without gaps, in the order of their ids, so that column k is class k."""
+        """Renumber the classes without gaps, in the order of their ids, so that column k is class k."""
         if self.num_classes == len(ids := self.class_ids):
             return self
         labels = np.where(self.labels >= 0, np.searchsorted(ids, self.labels).astype(np.int32), self.labels)
         return replace(self, labels=labels, class_names=dict(enumerate(self.class_names.values())))
 
     def with_ids(self, ids: Sequence[int]) -> Segmentation:
-        """Give classes that are numbered without gaps, and have no tree, (K,) different ids, 0 first."""
+        """Replace gapless class ids by K different ones, 0 first; `SettingsError` if they are not, or with a tree."""
         names, order = list(self.class_names.values()), np.argsort(ids).tolist()
         fits = all(isinstance(k, int | np.integer) and k <= MAX_LABEL for k in ids)
         if self.tree or not fits or not len(names) == self.num_classes == len(ids) == len({*ids}) or order[0] or ids[0]:
@@ -238,8 +238,8 @@ class Segmentation:
         return replace(result, shares=shares, learnt=learnt)
 
     def in_order_of(self, digest: str, places: np.ndarray) -> Segmentation:
-        """Give the result for the Gaussians in the order of the scene of a digest: places (N,) of these in this one."""
-        learnt = np.cumsum(self.clustered)[places] - 1  # rows, of those that were clustered
+        """Reorder the segmentation for the scene with `digest`; `places`, (N,): index here of each of its Gaussians."""
+        learnt = np.cumsum(self.clustered)[places] - 1  # row in `learnt` of each clustered Gaussian
         clustered = self.clustered[places]
         tree = self.tree and replace(self.tree, leaves=self.tree.leaves[places])
         return replace(
@@ -250,12 +250,12 @@ class Segmentation:
 
     @cached_property
     def probabilities(self) -> np.ndarray:
-        """Class probabilities with their zeros, (N, K) float32; 4 N K bytes, which nothing here takes but this."""
+        """Class probabilities as a dense array, (N, K) float32: 4 N K bytes, allocated on first access."""
         return self.shares.dense(len(self.class_names))
 
     @cached_property
     def confidence(self) -> np.ndarray:
-        """Largest probability of each Gaussian, (N,) float32; 0 where unobserved."""
+        """Largest class probability of each Gaussian, (N,) float32; 0 where unobserved."""
         return np.asarray(largest(self.shares)[0])
 
     def counts(self) -> np.ndarray:
@@ -263,12 +263,14 @@ class Segmentation:
         return np.bincount(self.labels[self.labels >= 0], minlength=self.num_classes)
 
     def render(self, operator: ViewOperator) -> RenderedLabels:
-        """Label map of a view: the class of the largest blended probability in each pixel.
+        """Render the label map of a view: the class of the largest blended probability in each pixel.
 
-        Here refinement has no say. A Gaussian across an edge is rightly a mixture: neighbours decide to which object it
-        goes, but the picture is sharper with what it learnt itself. One that the filter took out of its object still
-        covers what is behind it. What a ray has left over is background, if any mask ever showed the background; else
-        nothing. Raises `StateMismatchError` where the operator is of another scene, as all do that take one.
+        Blends the probabilities from before refinement. A Gaussian across an edge is rightly a mixture: its neighbours
+        decide to which object it goes, but the picture is sharper with its own probabilities. A removed Gaussian still
+        covers what is behind it. The remaining transmittance of a ray counts as background if any code has a share of
+        the background, else as nothing.
+
+        Raises `StateMismatchError` if the operator is of another scene, as do all methods that take an operator.
         """
         image = self.blend(operator)
         return RenderedLabels(self.class_ids[image.argmax(axis=2)], tempered(image, self.temperature).max(axis=2))
@@ -277,11 +279,11 @@ class Segmentation:
         self, scene: GaussianScene, cameras: Sequence[Camera], device: str = "cpu",
         num_views: int = RefineSettings.carve_views,
     ) -> Segmentation:  # fmt: skip
-        """Take out of each object what sticks out of its silhouettes in some views; these Gaussians become `REMOVED`.
+        """Remove from each object the Gaussians that stick out of its silhouettes in some views; they become `REMOVED`.
 
-        What the views show are the label maps that the segmentation itself renders, not the masks: they are learnt from
-        all masks together, so that errors of single masks carve nothing away. So many of the views have their say,
-        spread evenly. Raises `StateMismatchError` for another scene.
+        The silhouettes come from label maps that the segmentation renders, not from masks. The label maps are learnt
+        from all masks together, so errors of single masks remove nothing. `num_views` views are used, spread evenly.
+        Raises `StateMismatchError` for another scene.
         """
         look = partial(Silhouette.rendered, scene, self.label_map, device)
         return self.carved_by(scene, spread(cameras, num_views), look, device)
@@ -289,22 +291,19 @@ class Segmentation:
     def carved_by(
         self, scene: GaussianScene, views: Iterable[T], look: Callable[[T], Silhouette], device: str = "cpu"
     ) -> Segmentation:
-        """Take out of each object what sticks out of silhouettes, as `carved` does, of views of any kind.
-
-        Of each, `look` tells what it shows.
-        """
+        """Remove Gaussians that stick out of silhouettes, as `carved` does, for views of any type that `look` takes."""
         self.require(scene)
         return self._without(sticking_out(kept_shares(scene, self.labels, views, look, device=device), self.labels))
 
     def label_map(self, operator: ViewOperator) -> np.ndarray:
-        """Class of every pixel of a view, (H, W) int32: those of `render`, without the confidence."""
+        """Return the class of every pixel of a view, (H, W) int32: the labels of `render`, without the confidence."""
         codes, shows_background = self._codes_to_blend(operator)
         return np.asarray(self.class_ids[operator.strongest(codes, len(self.class_names), shows_background).classes])
 
     def label_map_beside(self, operator: ViewOperator, others: np.ndarray) -> tuple[np.ndarray, Blended]:
-        """Tell the class of every pixel, as `label_map` does, and blend in one pass what else Gaussians carry.
+        """Return the class of every pixel, as `label_map` does, and blend further values of Gaussians in the same pass.
 
-        That is (M, C) of the operator's `ids`, such as their colours.
+        `others`, (M, C), are values of the Gaussians in the operator's `ids`, such as their colours.
         """
         codes, shows_background = self._codes_to_blend(operator)
         found = operator.strongest(codes, len(self.class_names), shows_background, beside=others)
@@ -312,15 +311,18 @@ class Segmentation:
         return self.class_ids[found.classes], found.beside
 
     def blend(self, operator: ViewOperator) -> np.ndarray:
-        """Blend what was learnt into a view, (H, W, K) float32, not calibrated; rows sum to what is known of a pixel.
+        """Blend the learnt probabilities into a view, (H, W, K) float32, uncalibrated; sums are the known pixel share.
 
-        `gsseg_core.learn.temperature.tempered` at `temperature` makes probabilities of them.
+        `gsseg_core.learn.temperature.tempered` at `temperature` calibrates them.
         """
         codes, shows_background = self._codes_to_blend(operator)
         return operator.blend_probabilities(codes, len(self.class_names), shows_background)
 
     def _codes_to_blend(self, operator: ViewOperator) -> tuple[CSRRows, bool]:
-        """Codes as they were learnt, and whether any is of the background, to which then goes what rays leave over."""
+        """Return the codes as they were learnt, and whether any has a share of the background.
+
+        If so, the remaining transmittance of each ray counts as background.
+        """
         self.require(operator.scene)
         with _FIRST_ONE:
             return self._blended
@@ -331,16 +333,16 @@ class Segmentation:
         return codes, codes.has_column(0)
 
     def save(self, path: str | os.PathLike[str], run: str | None = None) -> None:
-        """Write labels, probabilities, confidence, class ids and names as one npz, atomically; ids and tree, if any.
+        """Write labels, probabilities, confidence, class ids and names, ids and tree (if any) to one npz, atomically.
 
-        `run` is the id of the run that it belongs to, for the header.
+        `run` is the id of the run to which the file belongs; it is written to the header.
 
         Raises
         ------
         WriteError
-            The file cannot be written; an earlier one is unchanged.
+            The file cannot be written; an existing file is unchanged.
         """
-        known = {int(k): name for k, name in self.class_names.items()}  # Ids may be NumPy's, as `class_ids` are.
+        known = {int(k): name for k, name in self.class_names.items()}  # JSON keys must not be NumPy integers.
         header = {"format": FORMAT, "scene": self.scene_digest, "class_names": known,
                   "temperature": self.temperature, **({} if run is None else {"run": run})}  # fmt: skip
         names, k = ("labels", "class_ids", "confidence", "clustered"), len(self.class_names)
@@ -353,17 +355,17 @@ class Segmentation:
 
     @classmethod
     def load(cls, path: str | os.PathLike[str], scene: GaussianScene) -> Segmentation:
-        """Read a segmentation of `scene`; all that is in it is checked.
+        """Read a segmentation of `scene` and check all of its content.
 
         Raises
         ------
         StateFileError
-            The file is missing or damaged, or holds what no segmentation holds: probabilities that do not sum to 1,
-            labels without a class, and the like.
+            The file is missing, damaged or invalid, for example with probabilities that do not sum to 1 or labels
+            without a class.
         StateMismatchError
             It belongs to another scene.
         WriteError
-            The run that wrote it was cut short at its very end, and cannot be finished now
+            The run that wrote it was interrupted just before its end, and the remaining steps fail now
             (`gsseg_core.files.run_folder`).
         """
         path = Path(path)

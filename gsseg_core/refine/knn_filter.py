@@ -1,7 +1,7 @@
-"""Refinement of learnt probabilities: KNN clustering of unsure Gaussians, and a statistical filter per object.
+"""Refinement of learnt probabilities: KNN clustering of uncertain Gaussians, and a statistical filter per object.
 
-Both steps take all classes at once, and say what they changed. Results are bit-identical whatever the order of the
-Gaussians and the number of threads.
+Both steps process all classes at once and return what they changed. Results are bit-identical for any order of the
+Gaussians and any number of threads.
 """
 
 from __future__ import annotations
@@ -17,20 +17,22 @@ from gsseg_core.spatial.row_order import rows_by_label
 
 def cluster(
     neighbours: Neighbours | None,  # of N Gaussians; None if there is only one
-    codes: CSRRows,  # N rows of float32 on the simplex; without entries where no view saw the Gaussian
+    codes: CSRRows,  # N rows of float32 that sum to 1; empty if no view saw the Gaussian
     num_classes: int,
     beta: float = RefineSettings.beta,
-    evidence: np.ndarray | None = None,  # (N,) px that each code stands on, for `neighbour_weights`
+    evidence: np.ndarray | None = None,  # (N,) px from which each code was learnt, for `neighbour_weights`
 ) -> tuple[CSRRows, np.ndarray]:
-    """Give every unsure and every unobserved Gaussian the mean code of the observed ones among its k nearest.
+    """Give every uncertain or unobserved Gaussian the mean code of the observed ones among its k nearest.
 
     Returns the codes, and which rows changed, (N,) bool.
 
-    Unsure are those whose largest probability is below `beta`. All neighbours' codes are those from before the step.
-    Where the paper is silent: codes are averaged as probabilities, not as logits; a Gaussian is not its own neighbour;
-    neighbours may be unsure themselves; Gaussians tied for the last place share its weight equally. One with no
-    observed neighbour keeps its code: a part of the scene that no view has come near stays unobserved. Without
-    evidence, all observed ones weigh the same, as in the paper.
+    A Gaussian is uncertain if its largest probability is below `beta`. All means use the codes from before the step.
+    Without evidence, all observed neighbours have equal weight, as in the paper. A Gaussian without observed neighbours
+    keeps its code, so parts of the scene far from all views stay unobserved. Choices that the paper leaves open:
+
+    - Codes are averaged as probabilities, not as logits.
+    - A Gaussian is not its own neighbour, and neighbours may be uncertain themselves.
+    - Gaussians tied for the last place share its weight equally.
 
     Examples
     --------
@@ -54,10 +56,10 @@ def cluster(
 
 def before_clustering(
     codes: CSRRows,  # N rows
-    clustered: np.ndarray,  # (N,) bool: which of them `cluster` changed
-    learnt: CSRRows,  # C rows: what these were before
+    clustered: np.ndarray,  # (N,) bool: rows that `cluster` changed
+    learnt: CSRRows,  # C rows: the codes of these before
 ) -> CSRRows:
-    """Give the codes that Gaussians have learnt themselves, and of those that learnt nothing what they are."""
+    """Restore the codes from before `cluster`; rows that were empty before keep their clustered codes."""
     rows = np.full(len(clustered), -1)
     rows[clustered] = np.where(learnt.known(), np.arange(learnt.num_rows), -1)
     return codes.replaced(rows, learnt)
@@ -65,15 +67,15 @@ def before_clustering(
 
 def statistical_filter(
     neighbours: Neighbours | None,  # of N Gaussians; None if there is only one
-    labels: np.ndarray,  # (N,) class of each; the background, 0, is no object and not filtered, nor are negative ones
+    labels: np.ndarray,  # (N,) class of each; background (0) and negative labels are not filtered
     sigmas: float = RefineSettings.filter_sigmas,
 ) -> np.ndarray:
-    """Find the Gaussians that lie too far from the rest of their own object, and are to be removed: (N,) bool.
+    """Mark the Gaussians to remove because they lie too far from the rest of their own object: (N,) bool.
 
-    D is the mean distance from a Gaussian to its k nearest others of its class, and one is removed where
-    D > mu + sigmas * sigma over the class. What the paper calls the variance sigma is taken as the standard deviation,
-    since it is added to a distance. A class of k members or fewer uses all others; one of fewer than three is left
-    alone. The limit has a slack of one millionth, the precision of D, so that objects of equal spacing stay whole.
+    D is the mean distance of a Gaussian to its k nearest others of its class. Gaussians with D > mu + sigmas * sigma
+    are marked, where mu and sigma are the mean and standard deviation of D over the class. (The paper calls sigma the
+    variance, but adds it to a distance.) A class of k members or fewer uses all others; one of fewer than three is not
+    filtered. The limit has a slack of 1e-6, the precision of D, so that objects of equal spacing stay whole.
 
     Examples
     --------
@@ -90,7 +92,7 @@ def statistical_filter(
         if label <= 0 or members.size < 3:
             continue
         distances = known[members]
-        in_order = np.sort(distances)  # rounding in the mean must not depend on the order of the Gaussians
+        in_order = np.sort(distances)  # so that rounding of the mean does not depend on the order of the Gaussians
         cut = in_order.mean() + sigmas * in_order.std()
         removed[members] = distances > cut * (1 + 1e-6)
     return removed

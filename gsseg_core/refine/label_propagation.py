@@ -1,15 +1,15 @@
 """Label propagation: Gaussians that hardly any view saw take the codes of their neighbours in space and colour.
 
-With e_i the weight in px that labelled pixels gave to Gaussian i, q_i its learnt code, and p_ij the weight of neighbour
-j in the graph (`gsseg_core.spatial.neighbour_graph`; they sum to 1 over j), the codes f minimise, each given its
-neighbours,
+Let e_i be the evidence of Gaussian i (the weight, in px, of the labelled pixels that saw it), q_i its learnt code, and
+p_ij the weight of neighbour j in the graph (`gsseg_core.spatial.neighbour_graph`; sum_j p_ij = 1). Each code f_i
+minimises the first expression given its neighbours; the second line is the solution:
 
     e_i |f_i - q_i|^2 + strength sum_j p_ij |f_i - f_j|^2
     f_i = (e_i q_i + strength sum_j p_ij f_j) / (e_i + strength)
 
-Where e_i is large, f_i is what was learnt; where it is zero, f_i is the mean of the neighbours: a harmonic function
-(Zhu, Ghahramani & Lafferty 2003, who fix the labelled points; here evidence holds them as firmly as it is heavy). A
-step computes all f_i from the f_j before it; rows stay on the simplex, and each step reaches one neighbour further.
+For large e_i, f_i is the learnt code. For e_i = 0, f_i is the mean of the neighbours: a harmonic function (Zhu,
+Ghahramani & Lafferty 2003, who fix the labelled points; here each is held in proportion to its evidence). A step
+computes all f_i from the previous f_j. Rows keep the sum 1, and each step reaches one neighbour further.
 """
 
 from __future__ import annotations
@@ -25,25 +25,25 @@ from gsseg_core.simd import LANES, add_scaled, differ, divided, empty_rows, load
 from gsseg_core.spatial.knn import CHUNK
 from gsseg_core.spatial.neighbour_graph import NEIGHBOURS, Graph
 
-SETTLED = np.float32(1e-3)  # a Gaussian is left alone while no probability around it changes by more in a step
+SETTLED = np.float32(1e-3)  # a Gaussian is skipped while no neighbour's probability changes by more than this in a step
 
 UNKNOWN_SHARE = 1 / 100
-"""Share of each view's labelled pixels that all other views leave unknown, from which on the graph is worth its time.
+"""Share of each view's labelled pixels that all other views leave unknown; propagation is worth its time above it.
 
-docs/few_views.md has what it gives on either side of this.
+docs/few_views.md has the gain above and below this share.
 """
 
-NEVER = 2**31 - 1  # steps to a place that no code reaches
-_AHEAD = 8  # places between the one that is worked on and the one that is fetched from memory
+NEVER = 2**31 - 1  # number of steps for a place that no code reaches
+_AHEAD = 8  # how many places ahead of the current one are prefetched from memory
 
 
 @dataclass(frozen=True)
 class GraphSettings:
-    """How codes spread along the graph; a value outside its range raises `SettingsError`."""
+    """Settings of label propagation; a value outside its range raises `SettingsError`."""
 
-    k: int = NEIGHBOURS  # neighbours of a Gaussian; of those tied for the last place as many more count
-    strength: float = 1.0  # evidence in px that weighs as much as all neighbours together; 0 leaves codes as they are
-    steps: int = 100  # at most, and so how many neighbours away a code can come from
+    k: int = NEIGHBOURS  # number of neighbours of a Gaussian; up to k more if several tie for the last place
+    strength: float = 1.0  # evidence, in px, that has the weight of all neighbours together; 0 changes no code
+    steps: int = 100  # at most; also the largest number of neighbours over which a code spreads
 
     def __post_init__(self) -> None:
         """Validate."""
@@ -55,14 +55,14 @@ class GraphSettings:
 
 def propagate(
     graph: Graph,  # of N Gaussians
-    codes: np.ndarray,  # (N, K) float32, rows on the simplex, or of zeros where nothing is known
-    evidence: np.ndarray,  # (N,) px of labelled pixels that each code stands on; not read where the code is zeros
-    settings: GraphSettings | None = None,  # all but k, with which the graph was built
+    codes: np.ndarray,  # (N, K) float32, rows sum to 1, or are zero if nothing is known
+    evidence: np.ndarray,  # (N,) px of labelled pixels from which each code was learnt; ignored for zero codes
+    settings: GraphSettings | None = None,  # without effect: k, which the graph already has
 ) -> np.ndarray:
-    """Spread codes along the graph, held by their evidence: (N, K) float32, the same for any number of threads.
+    """Spread codes along the graph against their evidence: (N, K) float32, the same for any number of threads.
 
-    A Gaussian with evidence of more than a hundred times the strength keeps its code, bit for bit; one that no code
-    reaches in all the steps stays a row of zeros. Arrays of other shapes raise `SceneValueError`.
+    A Gaussian whose evidence is at least a hundred times the strength keeps its code, bit for bit. A Gaussian that no
+    code reaches within the steps keeps a row of zeros. Arrays of other shapes raise `SceneValueError`.
 
     Examples
     --------
@@ -93,14 +93,14 @@ def propagate(
         _gather(codes, graph.order, first, learnt)
         spread = _spread(graph, readers, learnt, weight, moving & (reached <= 1), reached, settings.steps)
         _scatter(spread, graph.order, first, out, total)
-    # Classes settle apart from each other, so that the sum of a row is 1 only about as precisely as they do.
+    # Each block of classes converges separately, so rows only sum to 1 within the precision of convergence.
     _scale(out, graph.order, np.where(moving & (total > 0), total, np.float32(1)))
     return out
 
 
 @kernel(parallel=True)
 def _gather(codes: np.ndarray, order: np.ndarray, first: int, some: np.ndarray) -> None:  # (N, K), (N,); (N, 16) out
-    """Take sixteen columns of the codes, in the order of places, with zeros after the last column."""
+    """Copy sixteen columns of the codes, in the order of places; missing columns are zero."""
     count, last = min(codes.shape[1] - first, LANES), len(order) - 1
     for i in nb.prange(order.shape[0]):
         prefetch(codes, order[min(i + 2 * _AHEAD, last)])
@@ -110,7 +110,7 @@ def _gather(codes: np.ndarray, order: np.ndarray, first: int, some: np.ndarray) 
 
 @kernel(parallel=True)
 def _scatter(some: np.ndarray, order: np.ndarray, first: int, out: np.ndarray, total: np.ndarray) -> None:
-    """Put such columns back into all codes (N, K), and add their sum to that of each place, (N,)."""
+    """Write sixteen columns back into all codes (N, K), and add them to the row sum of each place, (N,)."""
     count = min(out.shape[1] - first, LANES)
     for i in nb.prange(order.shape[0]):
         for c in range(count):
@@ -120,7 +120,7 @@ def _scatter(some: np.ndarray, order: np.ndarray, first: int, out: np.ndarray, t
 
 @kernel(parallel=True)
 def _scale(codes: np.ndarray, order: np.ndarray, total: np.ndarray) -> None:
-    """Divide the codes of each place, (N, K), by a number, (N,)."""
+    """Divide the codes of each place, (N, K), by its row sum, (N,)."""
     for i in nb.prange(order.shape[0]):
         if total[i] != 1:
             for k in range(codes.shape[1]):
@@ -131,13 +131,13 @@ def _spread(
     graph: Graph, readers: tuple[np.ndarray, np.ndarray], learnt: np.ndarray, weight: np.ndarray, awake: np.ndarray,
     reached: np.ndarray, steps: int,
 ) -> np.ndarray:  # fmt: skip
-    """Step until the codes of some classes settle, from the places, (N,), that are awake; `_step` has the shapes.
+    """Iterate until the codes of some classes converge, starting from the `awake` places, (N,); `_step` has the shapes.
 
-    Who reads a place is as `_readers` lists it.
+    `readers` is the result of `_readers`.
     """
     codes = empty_rows(len(learnt))
     codes[:] = learnt
-    # Taken once: to get memory from the system anew in each step took a third of the time.
+    # Allocated once: allocation in each step took a third of the time.
     values, changed = empty_rows(len(learnt)), np.empty(len(learnt), bool)
     for step in range(steps):
         places = np.flatnonzero(awake).astype(np.int32)
@@ -155,9 +155,9 @@ def _step(
     reached: np.ndarray, step: int, places: np.ndarray, codes: np.ndarray,
     values: np.ndarray, changed: np.ndarray,  # (M, 16), (M,) out
 ) -> None:  # fmt: skip
-    """Compute the codes of M places from those around them, and tell which change.
+    """Compute the codes of M places from those of their neighbours, and mark the ones that change.
 
-    Codes are by place, (N, 16): as `learnt` and as they are. The evidence, `weight`, (N,), is a multiple of the
+    `learnt` and the current `codes` are by place, (N, 16). `weight`, (N,), is the evidence in multiples of the
     strength; `reached`, (N,) int32, is the step after which a code is known.
     """
     for chunk in nb.prange((places.shape[0] + CHUNK - 1) // CHUNK):
@@ -171,10 +171,10 @@ def _step(
             mass = weight[i]
             total = add_scaled(zero_row(), load_row(learnt, i), weight[i])
             for e in range(indptr[i], indptr[i + 1]):
-                # What is not reached yet is zero, and without a branch.
+                # Codes that are not reached yet are zero, so they can be added without a branch.
                 mass += weights[e] if reached[indices[e]] <= step else np.float32(0)
                 total = add_scaled(total, load_row(codes, indices[e]), weights[e])
-            # A code without evidence stays as it is until something is known around it.
+            # A code without evidence does not change until a neighbour is known.
             value = divided(total, mass) if mass > 0 else load_row(codes, i)
             store_row(values, m, value)
             changed[m] = differ(value, load_row(codes, i), SETTLED) != 0 or reached[i] == step + 1
@@ -185,7 +185,7 @@ def _take(
     places: np.ndarray, values: np.ndarray, changed: np.ndarray, indptr: np.ndarray, indices: np.ndarray,
     codes: np.ndarray, awake: np.ndarray,
 ) -> None:  # fmt: skip
-    """Write the codes of some places, and wake those that read what changed."""
+    """Write the codes of some places, and wake the places that read a changed one."""
     last = places.shape[0] - 1
     for m in nb.prange(places.shape[0]):
         prefetch(indices, indptr[places[min(m + 2 * _AHEAD, last)]])
@@ -197,7 +197,7 @@ def _take(
 
 @kernel
 def _steps_to_reach(indptr: np.ndarray, indices: np.ndarray, known: np.ndarray, steps: int) -> np.ndarray:
-    """Tell after how many steps the code of each place is known, (N,) int32, or NEVER."""
+    """Count the steps after which the code of each place is known, (N,) int32; `NEVER` if it stays unknown."""
     reached = np.where(known, np.int32(0), np.int32(NEVER))
     waiting = np.flatnonzero(~known)
     for step in range(1, steps + 1):
@@ -219,7 +219,7 @@ def _steps_to_reach(indptr: np.ndarray, indices: np.ndarray, known: np.ndarray, 
 
 @kernel
 def _readers(indptr: np.ndarray, indices: np.ndarray, moving: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """List, for each place, the places that move and have it as a neighbour, as CSR rows."""
+    """List, for each place, the moving places that have it as a neighbour, as CSR rows."""
     ends = np.zeros(moving.shape[0] + 1, np.int64)
     for i in np.flatnonzero(moving):
         for e in range(indptr[i], indptr[i + 1]):

@@ -1,4 +1,4 @@
-"""Settings of the refinement, apart from its kernels: who only reads options need not load them."""
+"""Settings of the refinement, in a module of their own so that parsing options does not load the kernels."""
 
 from __future__ import annotations
 
@@ -7,31 +7,31 @@ from numbers import Integral
 
 from gsseg_core.errors import SettingsError
 
-MAX_K = 1 << 20  # most neighbours: sums over more would overflow
+MAX_K = 1 << 20  # largest number of neighbours: sums over more would overflow
 
 
 @dataclass(frozen=True)
 class RefineSettings:
-    """How to refine; the defaults are what measured best, `PAPER` is the paper's way.
+    """Settings of the refinement; the defaults measured best, and `PAPER` does what the paper does.
 
     Attributes
     ----------
     k : int
-        Neighbours looked at by both steps, a number of Gaussians from 1 to 2^20.
+        Number of nearest Gaussians that both steps use, 1 to 2^20.
     beta : float
-        A Gaussian whose largest probability is below this one (0 to 1) takes the mean code of its neighbours.
+        A Gaussian whose largest probability is below this threshold (0 to 1) takes the mean code of its neighbours.
     filter_sigmas : float
-        A Gaussian is removed where its mean neighbour distance is more than this many standard deviations, 0 or more,
-        above the mean of its class.
+        A Gaussian is removed if its mean neighbour distance exceeds the mean of its class by more than this many
+        standard deviations, 0 or more.
     weigh : bool
-        Whether neighbours weigh by how well they were seen, where that is known; not in the paper.
+        Whether to weight neighbours by how well they were seen, if that is known; not in the paper.
     cluster, filter : bool
-        Whether to take each of the paper's two steps, KNN clustering and the statistical filter.
+        Whether to do the paper's KNN clustering and its statistical filter.
     carve : bool
-        Whether to cut objects to their silhouettes (`gsseg_core.refine.silhouette_carving`), in place of the filter;
-        where there are no views, nothing is cut.
+        Whether to cut objects to their silhouettes (`gsseg_core.refine.silhouette_carving`) instead of the filter;
+        without views, nothing is cut.
     carve_views : int
-        From how many views, 1 or more, spread evenly over the train views.
+        Number of views to carve with, 1 or more, spread evenly over the train views.
 
     Raises
     ------
@@ -50,7 +50,7 @@ class RefineSettings:
 
     def __post_init__(self) -> None:
         """Validate."""
-        if not isinstance(self.k, Integral) or not 1 <= self.k <= MAX_K:  # Kernels take no 50.0.
+        if not isinstance(self.k, Integral) or not 1 <= self.k <= MAX_K:  # Kernels do not accept 50.0.
             raise SettingsError(f"refinement: found k = {self.k}; expected a whole number from 1 to {MAX_K}")
         if not 0 <= self.beta <= 1:
             raise SettingsError(f"refinement: found beta = {self.beta}; expected a probability from 0 to 1")
@@ -63,4 +63,4 @@ class RefineSettings:
 
 
 PAPER = RefineSettings(weigh=False, filter=True, carve=False)  # KNN clustering and the statistical filter
-UNREFINED = RefineSettings(cluster=False, carve=False)  # codes as they were learnt
+UNREFINED = RefineSettings(cluster=False, carve=False)  # keeps codes as they were learnt
