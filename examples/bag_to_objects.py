@@ -1,11 +1,11 @@
-"""From a recorded bag to one PLY per object: no node, no running ROS, no installation of ROS.
+"""Turn a recorded bag into one PLY per object, without a node and without ROS installed.
 
     pip install rosbags
     python examples/bag_to_objects.py scene.ply BAG out
     python examples/bag_to_objects.py scene.ply BAG out --mask /front/mask --pose /slam/pose --class-names mug bowl
 
-BAG is a folder with metadata.yaml, a .mcap or a .db3, with masks, camera_info and poses as the node takes them: paired
-by their stamps, the pose that of the camera's optical frame in the frame of the scene.
+BAG is a folder with metadata.yaml, a .mcap or a .db3. It holds masks, camera_info and poses as for the node: with equal
+stamps per image, and with the pose of the camera's optical frame in the frame of the scene.
 """
 
 from __future__ import annotations
@@ -28,11 +28,11 @@ ENCODINGS = {
     "mono8": (np.uint8, 255), "8UC1": (np.uint8, 255),
     "mono16": (np.uint16, 65535), "16UC1": (np.uint16, 65535), "32SC1": (np.int32, -1),
 }  # fmt: skip
-"""Type of a pixel, and the number that means unknown."""
+"""Type of a pixel, and the value that means unknown."""
 
 
 def labels_of(mask: Any) -> np.ndarray:
-    """Turn a sensor_msgs/Image into labels, (H, W) int32, -1 where unknown."""
+    """Turn a sensor_msgs/Image into labels: (H, W) int32, -1 where unknown."""
     if mask.encoding not in ENCODINGS:
         raise GssegError(f"a mask is {mask.encoding}; expected one of {', '.join(ENCODINGS)}")
     kind, unknown = ENCODINGS[mask.encoding]
@@ -97,7 +97,7 @@ def main() -> None:
     try:
         scene = GaussianScene.load(options.scene)
         views = list(read_views(options.bag, topics, skipped))
-        for why, count in skipped.items():  # Before anything fails for want of them.
+        for why, count in skipped.items():  # Print this first: too few masks may make a later step fail.
             if count:
                 print(f"skipped {count} masks: {why}")
         labels = range(1 + max([len(options.class_names), *(view.largest_label for view in views)]))

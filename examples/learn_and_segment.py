@@ -1,9 +1,9 @@
 """Learn from the masks that the node has received, get all objects, and save one of them as an array.
 
-While `segment_node` runs and masks have come (see examples/README.md):
+Run it while `segment_node` runs and has received masks (see examples/README.md):
 
-    python examples/learn_and_segment.py                   # what is there
-    python examples/learn_and_segment.py --save mug        # and mug.npy, (M, 3) metres in the map frame
+    python examples/learn_and_segment.py                   # print every object
+    python examples/learn_and_segment.py --save mug        # also write mug.npy, (M, 3) metres in the map frame
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ options = parser.parse_args()
 try:
     with SegmentationClient(options.node) as client:
         client.wait_until_active()
-        with contextlib.suppress(NodeUnavailableError):  # It says itself that there is none to learn from.
+        with contextlib.suppress(NodeUnavailableError):  # learn() raises a clear error if there are no views.
             client.wait_for_views(1, timeout=10)  # masks may still be on their way
         learnt = client.learn(on_feedback=lambda stage, done, total, loss: print(f"{stage} {done}/{total}"))
         result = client.segment()

@@ -1,14 +1,14 @@
-"""Make masks of photos with a 2D segmenter, and write them as a dataset wants them.
+"""Make masks from photos with a 2D segmenter, and write them in the layout of a dataset.
 
     pip install scikit-image
     python examples/masks_from_photos.py DATASET --out auto
     gsseg segment scene.ply --data DATASET --out out --labels auto --ids per-view
 
-The segmenter here is Felzenszwalb and Huttenlocher's (2004), which needs no weights. It knows no objects: it finds
-areas of one colour, and numbers them anew in every photo, as automatic mask generators do. To use another one, rewrite
-`segment_photo`; all else stays.
+The segmenter here is Felzenszwalb and Huttenlocher's (2004), which needs no weights. It does not recognise objects: it
+finds areas of one colour, and numbers them anew in every photo, as automatic mask generators do. To use another
+segmenter, rewrite `segment_photo` only.
 
-Without images/ in DATASET, `--scene` renders the scene in the place of photos that no lens has bent.
+If DATASET has no images/, `--scene` renders the scene in place of the photos. The cameras must have no lens distortion.
 """
 
 from __future__ import annotations
@@ -25,16 +25,16 @@ from gsseg_core import Dataset, GaussianScene, GssegError, View, make_operator
 from gsseg_core.data.label_images import UNKNOWN, write_mask
 
 SCALE = 300
-"""How unlike two areas have to be to stay apart; larger means fewer areas."""
+"""How different two areas must be to stay separate; larger values give fewer areas."""
 
 LEAST, MOST = 0.001, 0.25
-"""Share of the image below which an area is taken for noise, and above which for the background."""
+"""Areas below the first share of the image count as noise, areas above the second as background."""
 
 
 def segment_photo(
     photo: np.ndarray,  # (H, W, 3) uint8
 ) -> np.ndarray:
-    """Find areas: (H, W) int32 with a number for each, 0 for the background and -1 where nothing is known."""
+    """Find areas: (H, W) int32 with a number for each, 0 for background and -1 for unknown."""
     areas = felzenszwalb(photo, scale=SCALE, sigma=0.8, min_size=int(LEAST * photo[..., 0].size))
     share = np.bincount(areas.ravel()) / areas.size
     numbers = np.where(share > MOST, 0, np.where(share < LEAST, UNKNOWN, 1 + np.arange(len(share))))

@@ -1,15 +1,15 @@
-"""Ask the node for its objects and print their boxes as JSON, and how a gripper would take them.
+"""Ask the node for its objects, and print their boxes and gripper directions as JSON.
 
-While `segment_node` runs and masks have come (see examples/README.md):
+Run it while `segment_node` runs and has received masks (see examples/README.md):
 
     python examples/objects_to_boxes.py                                   # every object
-    python examples/objects_to_boxes.py mug bowl --min-confidence 0.7     # two, without what is in doubt
-    python examples/objects_to_boxes.py --opening 0.08                    # what a hand of 8 cm can close around
+    python examples/objects_to_boxes.py mug bowl --min-confidence 0.7     # two, without uncertain Gaussians
+    python examples/objects_to_boxes.py --opening 0.08                    # for a gripper that opens 8 cm
 
-One line an object, in metres of the map frame: the middle of its box, the directions and lengths of the box's sides,
-the longest first, its mean and covariance, and, where a side is shorter than the hand opens, the direction along which
-to close: the shortest such side. Boxes lie as the objects do, and stray Gaussians do not blow them up. A planner that
-is a ROS node itself gets the same from the topic ~/objects.
+It prints one line per object, in metres in the map frame: the centre of its box, the directions and lengths of the
+box's sides (longest first), its mean and its covariance. If a side is shorter than the gripper's opening, `close_along`
+is the direction of the shortest side. Boxes are oriented along the objects, and stray Gaussians do not enlarge them. A
+planner that is a ROS node gets the same from the topic ~/objects.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ from gsseg_ros.client import NodeUnavailableError, SegmentationClient, Segmentat
 parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
 parser.add_argument("classes", nargs="*", metavar="CLASS", help="names of the classes wanted (default: all)")
 parser.add_argument("--min-confidence", type=float, default=0.5, help="0 to 1 (default: %(default)s)")
-parser.add_argument("--opening", type=float, default=0.1, help="of the hand, in metres (default: %(default)s)")
+parser.add_argument("--opening", type=float, default=0.1, help="of the gripper, in metres (default: %(default)s)")
 parser.add_argument("--node", default="gsseg", help="name of the node (default: %(default)s)")
 options = parser.parse_args()
 if not options.opening > 0:

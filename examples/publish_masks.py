@@ -3,16 +3,16 @@
     python examples/publish_masks.py DATASET --rate 5
     python examples/publish_masks.py DATASET --ros-args -r mask:=/front/mask -r camera_info:=/front/camera_info
 
-What the segmentation node expects, and what goes wrong most often:
+The segmentation node expects the following; most failures come from these points:
 
-stamps    mask, camera_info and pose carry the stamp of the image that the mask was made from: when it was taken, and
-          not when the network was done. They are paired by it.
+stamps    mask, camera_info and pose carry the stamp of the image that the mask was made from: the time of the image,
+          not the time when the network finished. The node pairs them by it.
 frames    the pose is that of the camera's optical frame (x right, y down, z forward) in the map frame.
 pixels    the image is rectified: d is all zeros, and k belongs to the rectified image at the size of the mask.
-labels    mono8 (255: unknown) or mono16 (65535: unknown), a class number per pixel, 0 for the background; never
-          colours, never resized with interpolation.
-QoS       reliable: the segmentation node hears any publisher, but what a best-effort one loses, of large masks half, is
-          lost for good.
+labels    mono8 (255: unknown) or mono16 (65535: unknown), a class number per pixel, 0 for background; never colours,
+          never resized with interpolation.
+QoS       reliable. The segmentation node accepts any publisher, but a best-effort publisher loses up to half of the
+          large masks, and these are not sent again.
 """
 
 from __future__ import annotations
@@ -39,7 +39,7 @@ MAP_FRAME, OPTICAL_FRAME = "map", "camera_optical_frame"
 
 
 class Segmenter(Node):
-    """Publishes one view at each tick; `done` once there are no more."""
+    """Publishes one view at each tick; `done` is true once there are no more."""
 
     def __init__(self, views: list[View], rate: float) -> None:
         super().__init__("segmenter")
@@ -50,9 +50,9 @@ class Segmenter(Node):
         self.create_timer(1 / rate, self.tick)
 
     def tick(self) -> None:
-        """Publish the next view, once somebody listens."""
+        """Publish the next view, once every topic has a subscriber."""
         if not all(topic.get_subscription_count() for topic in (self.masks, self.camera_infos, self.poses)):
-            self.get_logger().info("waiting for somebody who listens", throttle_duration_sec=5.0)
+            self.get_logger().info("waiting for subscribers", throttle_duration_sec=5.0)
             return
         view = next(self.views, None)
         if view is None:
@@ -62,7 +62,7 @@ class Segmenter(Node):
 
     def publish(self, view: View) -> None:
         """Publish mask, camera_info and pose of one image."""
-        # On a robot: image.header.stamp of the camera's image, handed on unchanged.
+        # On a robot: copy image.header.stamp of the camera's image unchanged.
         stamp = self.get_clock().now().to_msg()
         optical = Header(stamp=stamp, frame_id=OPTICAL_FRAME)
 
@@ -89,7 +89,7 @@ class Segmenter(Node):
             )
         )
 
-        # On a robot: from localisation or TF, looked up at the stamp.
+        # On a robot: take the pose from localisation, or look it up in TF at the stamp.
         camera_in_map = np.linalg.inv(view.camera.world_to_camera)
         x, y, z = camera_in_map[:3, 3].tolist()
         qx, qy, qz, qw = quaternion_from_rotation(camera_in_map[:3, :3])

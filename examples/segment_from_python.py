@@ -2,7 +2,7 @@
 
     python examples/segment_from_python.py scene.ply DATASET out
 
-The README says what a DATASET folder holds; `make demo-local` makes one, demo_out/scene, with scene.ply in it.
+The README describes the DATASET folder. `make demo-local` makes one, demo_out/scene, with scene.ply in it.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ try:
     learner.fit()
     result = Segmentation.from_codes(scene, learner.codes_, data.class_names, evidence=learner.evidence())
     result = result.carved(scene, [view.camera for view in data.views("train")])  # cut to the silhouettes
-    result = result.calibrated(calibrate(learner).temperature)  # of those 80 % sure, 80 % are right
+    result = result.calibrated(calibrate(learner).temperature)  # 80 % confident: 80 % right
     files = export_classes(scene, result, options.out)
 except GssegError as error:
     sys.exit(f"segment_from_python: {error}")
