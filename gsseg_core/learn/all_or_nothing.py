@@ -1,4 +1,4 @@
-"""What is done whole or not at all: whatever ends it half-way, Ctrl-C or too little memory too, it is undone."""
+"""Undoes operations that fail half-way, whatever stops them: an error, Ctrl-C or too little memory."""
 
 from __future__ import annotations
 
@@ -14,11 +14,11 @@ Undo = Callable[[], object]
 
 
 def checkpoint(thing: object, ending: str = "", /, **copies: Any) -> Undo:
-    """Return what gives an object the attributes back that end so; `copies` are of those that change in place."""
+    """Return a function that restores the attributes that end with `ending`; pass `copies` of mutable ones."""
     attributes = vars(thing)
     before = {**{name: value for name, value in attributes.items() if name.endswith(ending)}, **copies}
 
-    def undo() -> None:  # It takes no memory to speak of: there may be none.
+    def undo() -> None:  # Must need almost no memory, because there may be none left.
         for name in [name for name in attributes if name.endswith(ending) and name not in before]:
             del attributes[name]
         attributes.update(before)
@@ -28,7 +28,7 @@ def checkpoint(thing: object, ending: str = "", /, **copies: Any) -> Undo:
 
 @contextmanager
 def all_or_nothing(*undo: Undo) -> Iterator[None]:
-    """Undo what the body has done, one after the other, if it raises anything."""
+    """Call the `undo` functions in order if the body raises anything."""
     try:
         yield
     except BaseException:
@@ -38,7 +38,7 @@ def all_or_nothing(*undo: Undo) -> Iterator[None]:
 
 
 def fits_whole(fit: Callable[P, R]) -> Callable[P, R]:
-    """Decorate a `fit`: if an error ends it half-way, all attributes that end with "_" are those of an earlier one."""
+    """Decorate a `fit` so that an error half-way restores all attributes that end with "_" to those from before."""
 
     @wraps(fit)
     def whole(*args: P.args, **kwargs: P.kwargs) -> R:

@@ -1,8 +1,8 @@
-"""Calibration: the temperature of what was learnt, fitted to masks that it has not learnt from.
+"""Calibration: fits the temperature of learnt probabilities to masks that they were not learnt from.
 
-No truth is needed. The masks of a few views, spread evenly, are predicted by `Learner.predict_without`: from all other
-views by `em` and `votes`; by `gradient` from the codes as they are, which have seen the mask, though one view of many
-moves them little.
+It needs no ground truth. `Learner.predict_without` predicts the masks of a few views, spread evenly: `em` and `votes`
+predict each from all other views. `gradient` uses its codes unchanged, which were also learnt from the mask; one view
+of many has little influence on them.
 """
 
 from __future__ import annotations
@@ -17,23 +17,23 @@ from gsseg_core.progress import Progress, silent, with_progress
 
 
 class Calibration(NamedTuple):
-    """A fitted temperature, and from what."""
+    """A fitted temperature, and the data to which it was fitted."""
 
     temperature: float  # for `Segmentation.calibrated`
-    views: int  # whose masks it was fitted to
-    pixels: int  # of these
-    unknown: float  # share of their labelled pixels, as far as sampled, of which little is predicted; 1 if none was
-    held_out: bool  # whether the masks were predicted without learning from them
+    views: int  # number of views whose masks were used
+    pixels: int  # number of sampled pixels
+    unknown: float  # share of sampled labelled pixels that are mostly not predicted; 1 if no pixel was sampled
+    held_out: bool  # whether each mask was predicted without learning from it
 
     def as_dict(self) -> dict[str, Any]:
-        """Give it as `report.json` does."""
+        """Return the entry for `report.json`."""
         return {**self._asdict(), "temperature": round(self.temperature, 4), "unknown": round(self.unknown, 4)}
 
 
 def calibrate(learner: Learner, checker: MaskChecker | None = None, progress: Progress = silent) -> Calibration:
-    """Fit the temperature of a learner's codes, after `fit`; nothing of it changes.
+    """Fit the temperature of a learner's codes, after `fit`; the learner does not change.
 
-    A checker of this learner may be at hand: what it has rendered is not rendered again.
+    Pass a `checker` of this learner, if there is one, to reuse what it has rendered.
     """
     views, checker = spread(list(learner.views.values()), VIEWS), checker or MaskChecker(learner)
     samples = [checker.sample(view) for view in with_progress(progress, "calibrate", views)]

@@ -1,4 +1,4 @@
-"""How much memory is free for this process: what the machine has left, and what its control groups let it take."""
+"""Finds how much memory this process can use: the free memory of the machine, limited by its control groups."""
 
 from __future__ import annotations
 
@@ -8,14 +8,15 @@ from pathlib import Path
 
 GROUPS = {"": ("memory.max", "memory.current", "inactive_file"),
           "memory": ("memory.limit_in_bytes", "memory.usage_in_bytes", "total_inactive_file")}  # fmt: skip
-"""By controller in /proc/self/cgroup, "" being version 2: files with limit and use, and what of the use is given up."""
+"""By controller in /proc/self/cgroup ("" is version 2): files of limit and use, and key of the reclaimable use."""
 
 
 def free_memory(proc: Path = Path("/proc"), groups: Path = Path("/sys/fs/cgroup")) -> int | None:
-    """Tell how many bytes can be taken without anything else being pushed out; None where the system does not say.
+    """Return how many bytes can be allocated without evicting anything else; None if the system does not tell.
 
-    Cached files count as free: the system gives them up. A limit of any group around the process counts, of either
-    version of cgroups; inside a container the groups outside of it are not seen, and their limits stand at its root.
+    Cached files count as free, since the system drops them when needed. The limits of all groups around the process
+    count, of either version of cgroups. A container does not see the groups outside it; their limits appear at its
+    root.
     """
     left = list(_left_in_groups(proc, groups))
     with suppress(OSError, ValueError, IndexError):
@@ -30,7 +31,7 @@ def _left_in_groups(proc: Path, groups: Path) -> Iterator[int]:
             for controller in GROUPS.keys() & controllers.split(","):
                 group = Path(path.lstrip("/"))
                 for folder in (group, *group.parents):
-                    with suppress(OSError, ValueError):  # One without a limit says "max", or has no such files.
+                    with suppress(OSError, ValueError):  # A group without a limit has "max", or no such files.
                         yield _left_in(groups / controller / folder, *GROUPS[controller])
 
 

@@ -1,4 +1,4 @@
-"""The paper's learner: Adam on the cross-entropy between rendered codes and masks."""
+"""The paper's learner: minimises the cross-entropy between rendered codes and masks with Adam."""
 
 from __future__ import annotations
 
@@ -25,11 +25,11 @@ class GradientSettings:
     rate : float
         Initial rate of Adam, per step, in units of the codes.
     final_rate : float
-        Rate at the last step; in between it falls exponentially.
+        Rate at the last step; the rate decays exponentially.
     epochs : int
-        Passes over all views.
+        Number of passes over all views.
     seed : int
-        Seed of the order of the views.
+        Random seed of the order of the views.
     """
 
     rate: float = 0.05
@@ -56,22 +56,23 @@ class GradientLearner(Learner):
     - Loss of one class (eq. 3): L_i = -1/N sum_n M_i^n log M_bar_i^n over the N pixels with a label.
     - Loss of one view and of all (eq. 4): CES = 1/K sum_i L_i, and the mean of CES over the L views.
 
-    Where the paper is silent, this was chosen:
+    Choices that the paper leaves open:
 
-    - The softmax of the codes is taken before blending, so a rendered code is a probability up to the transmittance
-      left over, which belongs to class 0. (The paper takes the softmax in its clustering step, and speaks of
+    - The softmax of the codes is taken before blending. So rendered codes are probabilities up to the remaining
+      transmittance, which counts as class 0. (The paper takes the softmax in its clustering step, and mentions
       rendered probabilities.)
     - All codes start at zero, the "initial state of uniform distribution across all categories" of its section 3.2.
-    - Adam with rate 0.05, falling exponentially to a tenth; one view a step, in random order, ten times over all views.
-    - Rays end at surfaces, as wherever masks are learnt from (`T_LIFTED` in `gsseg_core.raster.constants`).
-    - Pixels whose label is unknown do not count, neither in the sum nor in N.
-    - Where a mask is soft or partial, a rendered code counts by how plausible the pixel's label makes each class (see
-      `gsseg_core.data.label_evidence`): -log sum_k pl(k) M_bar_k. With one class per label that is the same.
+    - Adam starts with rate 0.05, which decays exponentially to a tenth. Each step uses one view; ten epochs go through
+      all views in random order.
+    - Rays end at surfaces, as for all learning from masks (`T_LIFTED` in `gsseg_core.raster.constants`).
+    - Pixels with an unknown label count neither in the sum nor in N.
+    - For a soft or partial mask, rendered codes are weighted by the plausibility of each class given the pixel's label
+      (see `gsseg_core.data.label_evidence`): -log sum_k pl(k) M_bar_k. With one class per label this is eq. 3.
 
     Attributes
     ----------
     history_ : list of float
-        After `fit`: mean loss of each epoch, while it ran.
+        After `fit`: mean loss over the steps of each epoch.
     """
 
     def __init__(
@@ -83,12 +84,12 @@ class GradientLearner(Learner):
 
     @classmethod
     def default_settings(cls, max_steps: int | None, seed: int) -> tuple[GradientSettings]:
-        """Return settings for the registry; `max_steps` are epochs."""
+        """Return the default settings, with `max_steps` as number of epochs if given, and the seed."""
         return (GradientSettings(epochs=GradientSettings.epochs if max_steps is None else max_steps, seed=seed),)
 
     @property
     def loss(self) -> float:
-        """Cross-entropy summed over the classes (K times CES), in nats per labelled pixel; mean of the last epoch."""
+        """Mean cross-entropy of the last epoch, summed over the classes (K times CES), in nats per labelled pixel."""
         return self.history_[-1] * self.num_classes if self.history_ else float("nan")
 
     @fits_whole
@@ -123,7 +124,7 @@ class GradientLearner(Learner):
 
 
 class _Adam:
-    """Makes steps of Adam as `torch.optim.Adam` does, bit for bit; that one loads a compiler first, which takes 4 s."""
+    """Adam with bit for bit the steps of `torch.optim.Adam`, which would first load a compiler for 4 s."""
 
     def __init__(self, codes: torch.Tensor) -> None:
         self._codes, self._steps = codes, 0
@@ -139,9 +140,9 @@ class _Adam:
 
 
 def cross_entropy(probabilities: np.ndarray, observation: Observation) -> tuple[np.float32, np.ndarray]:  # (N, K)
-    """CES of one view (eq. 3 and 4 of the paper), and its gradient W^T dL/dO by the probabilities, (N, K) float32.
+    """Return CES of one view (eq. 3 and 4) and its gradient W^T dL/dO by the probabilities, (N, K) float32.
 
-    In each pixel, the loss touches only the class seen there, and so does its gradient.
+    In each pixel, loss and gradient depend only on the class that the mask has there.
     """
     gradient, scale = np.zeros_like(probabilities), 1.0 / (observation.num_pixels * probabilities.shape[1])
     if observation.evidence.mass is None:

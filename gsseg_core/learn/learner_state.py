@@ -1,9 +1,9 @@
-"""What has been learnt of one scene, on disk: views with their masks, votes and codes, in one compressed npz.
+"""Saves and loads the learning state of one scene: views with their masks, votes and codes, in one compressed npz.
 
-Of votes and codes, (N, K), only what is not zero is in the file (docs/conventions.md says how to read it with NumPy).
+The file has only the non-zero entries of votes and codes, (N, K); docs/conventions.md says how to read it with NumPy.
 
-The state of a scene that changes holds the geometry of the scene, too: votes can then be carried over to what the scene
-has become.
+The state of a scene that changes also has the geometry of the scene, so that its votes can be transferred to the
+changed scene.
 """
 
 from __future__ import annotations
@@ -45,18 +45,18 @@ from gsseg_core.scene.scene_delta import MAX_ID
 from gsseg_core.text import clipped, quoted
 
 FORMAT, WITH_ZEROS, WHOLE_RAYS = "gsseg-state-3", "gsseg-state-2", "gsseg-state-1"
-"""What states say that they are: of this version; of those that wrote votes and codes with all their zeros; and of
-those, older still, whose rays went on behind surfaces."""
+"""Format names: of this version; of older ones that wrote votes and codes as dense arrays; and of still older ones
+whose rays went on behind surfaces."""
 
 _FORMATS = FORMAT, WITH_ZEROS, WHOLE_RAYS
 
 OBJECTS_OF_ONE_SESSION = "holds objects that its own session found and numbered (ids per-view)"
-"""What errors say of a state with `per_view`, where classes are expected that mean the same to others."""
+"""Text of errors for a state with `per_view`, where classes must have the same meaning in other sessions."""
 
 _MOST_VIEWS = 2**31 - 1
-_MOST_DROPPED = 1 << 20  # that are listed: in memory, each takes some 60 bytes
+_MOST_DROPPED = 1 << 20  # most dropped views to list: each takes some 60 bytes of memory
 _MOST_VOTES = 2.0**62
-_VIEW_VOTES = UNITS * LIMITS.max_pixels  # votes of one view for one Gaussian, at most, in units of `VOTE_UNIT`
+_VIEW_VOTES = UNITS * LIMITS.max_pixels  # most votes of one view for one Gaussian, in units of `VOTE_UNIT`
 
 
 @dataclass(frozen=True, eq=False)
@@ -64,43 +64,44 @@ class Learnt:
     """Class probabilities that a learner has found."""
 
     learner: str  # its name
-    codes: CSRRows  # (N, K) float32: class probabilities; no entries where no labelled pixel saw the Gaussian
-    num_views: int  # that it learnt from
-    temperature: float = 1.0  # at which the codes are probabilities, see `gsseg_core.learn.calibrate`
-    evidence: np.ndarray | None = None  # (N,) float32: px that the codes stand on; an older state does not say
-    # Ids in the masks that name one object, see `gsseg_core.learn.renamed_ids`; a state on disk does not say.
+    codes: CSRRows  # (N, K) float32: class probabilities; rows are empty if no labelled pixel saw the Gaussian
+    num_views: int  # number of views that it learnt from
+    temperature: float = 1.0  # that calibrates the codes, see `gsseg_core.learn.calibrate`
+    evidence: np.ndarray | None = None  # (N,) float32: px from which codes were learnt; None for an older state
+    # Mask ids of the same object, see `gsseg_core.learn.renamed_ids`; not saved to disk.
     renamed: Mapping[int, int] = field(default_factory=dict)
 
     def carried(self, carry: Callable[[Any], Any]) -> Learnt:
-        """Return it for a scene that has changed; `carry` makes rows of Gaussians, dense or sparse, those of now."""
+        """Return the same for the changed scene; `carry` converts rows, dense or sparse, to its Gaussians."""
         evidence = None if self.evidence is None else carry(self.evidence)
         return replace(self, codes=carry(self.codes), evidence=evidence)
 
 
 @dataclass(frozen=True, eq=False)
 class State:
-    """What is saved of one scene."""
+    """The saved learning state of one scene."""
 
-    votes: CSRRows  # N rows, int64: of all views so far, in units of `VOTE_UNIT`; none of them zero
+    votes: CSRRows  # N rows, int64: non-zero votes of all views so far, in units of `VOTE_UNIT`
     num_classes: int  # K, of votes and codes
-    views: list[View]  # those that were kept, in the order in which they came
-    num_fused: int  # views in the votes, at least as many as were kept
-    class_names: dict[int, str] = field(default_factory=dict)  # as far as they are known
+    views: list[View]  # views that were kept, in the order in which they were added
+    num_fused: int  # number of views in the votes, kept or not
+    class_names: dict[int, str] = field(default_factory=dict)  # may lack names of some classes
     learnt: Learnt | None = None  # the best codes
-    living: LivingScene | None = None  # the scene, if it changes and so is in the file
-    per_view: bool = False  # whether its classes are objects that its session found and numbered itself
-    whole_rays: bool = False  # whether a version has cast the votes whose rays went on behind surfaces
-    dropped: tuple[bytes, ...] = ()  # `View.digest` of those that are in the votes and no longer kept, as far as known
+    living: LivingScene | None = None  # the scene, if it changes; it is then saved, too
+    per_view: bool = False  # whether its session found and numbered the classes, which are objects, itself
+    whole_rays: bool = False  # whether the votes are of an older version whose rays went on behind surfaces
+    dropped: tuple[bytes, ...] = ()  # `View.digest` of views in the votes that are no longer kept, as far as known
 
     @property
     def all_known(self) -> bool:
-        """Whether all views in the votes are kept or among the `dropped`; an older version did not list these."""
+        """Whether all views in the votes are kept or listed in `dropped`, which older versions did not write."""
         return self.num_fused == len(self.views) + len(self.dropped)
 
     def save(self, path: str | os.PathLike[str], digest: str) -> None:
-        """Write the state of the scene with this digest, atomically (`WriteError`); colours are not in the file.
+        """Write the state of the scene with this digest, atomically; the file has no colours.
 
-        Raises `PathTakenError` where something is there that is no saved state; it is unchanged.
+        Raises `WriteError` if it cannot be written, and `PathTakenError` if the path has anything but a saved state,
+        which is then unchanged.
         """
         path = Path(path)
         check_replaceable(path, "saved state", npz_format(path) in _FORMATS)
@@ -137,20 +138,21 @@ class State:
             arrays[f"pose_{i}"] = np.stack([np.pad(view.camera.K, (0, 1)), view.camera.world_to_camera])
         with write_atomically(path) as temporary:
             write_arrays(temporary, header, **arrays)
-            check_replaceable(path, "saved state", npz_format(path) in _FORMATS)  # To save takes long.
+            check_replaceable(path, "saved state", npz_format(path) in _FORMATS)  # Again, since writing takes long.
 
     @classmethod
     def load(
         cls, path: str | os.PathLike[str], digest: str, num_gaussians: int, within: Path | None = None,
         first: LivingScene | None = None,
     ) -> State:  # fmt: skip
-        """Read what was saved for the same scene, below `within` if given, links followed; all of it is checked.
+        """Read a state of the scene with this digest and check all of its content.
 
-        With `first`, what was saved for that scene or holds the geometry of its own is read as well; `living` is then
-        the scene that it was saved for.
+        With `first`, the state of any changed scene that has its own geometry, or of the scene `first` itself, is read
+        as well; `living` is then the scene of the state. With `within`, the file must lie below that folder after links
+        are resolved.
 
-        Raises `StateFileError` where the file is missing or damaged, or holds what no state holds,
-        `StateMismatchError` where it belongs to another scene, `PathNotAllowedError` where it lies outside `within`.
+        Raises `StateFileError` if the file is missing, damaged or invalid, `StateMismatchError` if it belongs to
+        another scene, `PathNotAllowedError` if it lies outside `within`.
         """
         path = Path(path)
         with open_npz(path, "a saved state", _FORMATS, None if first else digest, within) as (file, header):
@@ -165,7 +167,7 @@ class State:
 
     @classmethod
     def load_alone(cls, path: str | os.PathLike[str]) -> tuple[str, State]:
-        """Read a state without its scene: the scene's digest, and the state; raises `StateFileError` as `load` does."""
+        """Read a state without its scene: return scene digest and state; raises `StateFileError` as `load` does."""
         with open_npz(Path(path), "a saved state", _FORMATS, None) as (file, header):
             living = LivingScene.read(file, header)
             n = whole_number(header["shape"][0], "a side of the votes", 1, LIMITS.max_gaussians)
@@ -209,10 +211,10 @@ def _entry(view: View) -> dict[str, Any]:
 
 
 def _read_votes(file: NpzArrays, shape: tuple[int, int], num_kept: int, num_fused: int) -> CSRRows:
-    """Read votes, N rows of int64; of a Gaussian they cannot be more than the pixels of all views."""
+    """Read votes, N rows of int64, and check that no Gaussian has more votes than the views have pixels."""
     older = "votes" in file.names
     given = _read_votes_with_zeros(file, shape) if older else file.expect_sparse("votes", np.int64, shape)
-    # Only masks that tell what is not there vote against a class; of views that were not kept, nobody knows.
+    # Only partial masks vote against classes; views that were not kept may have had partial masks.
     may_oppose = num_fused > num_kept or any(name.startswith("supervised_") for name in file.names)
     if not may_oppose and given.data.min(initial=0) < 0:
         raise UnfitError(f"array votes holds {given.data.min()}; expected none below 0")
@@ -226,7 +228,7 @@ def _read_votes(file: NpzArrays, shape: tuple[int, int], num_kept: int, num_fuse
 
 
 def _read_votes_with_zeros(file: NpzArrays, shape: tuple[int, int]) -> CSRRows:
-    """Read votes as an older version wrote them: of the Gaussians that have any, with all zeros."""
+    """Read votes of an older version, which wrote dense rows of the Gaussians that have votes."""
     seen = file.expect("seen", np.int64, (None,))
     if np.any(np.diff(seen) <= 0) or np.any((seen < 0) | (seen >= shape[0])):
         raise UnfitError(f"array seen holds no Gaussians; expected ascending numbers from 0 to {shape[0] - 1}")
@@ -237,7 +239,7 @@ def _read_votes_with_zeros(file: NpzArrays, shape: tuple[int, int]) -> CSRRows:
 
 
 def _read_codes(file: NpzArrays, shape: tuple[int, int]) -> CSRRows:
-    """Read class probabilities, N rows of float32; an older version wrote them with all zeros."""
+    """Read class probabilities, N rows of float32, or the dense array of an older version."""
     if "codes" not in file.names:
         return file.expect_sparse("codes", np.float32, shape)
     codes = file.expect_rows("codes", np.float32, (shape[0], None))
@@ -247,7 +249,7 @@ def _read_codes(file: NpzArrays, shape: tuple[int, int]) -> CSRRows:
 
 
 def _read_evidence(file: NpzArrays, num_gaussians: int) -> np.ndarray | None:
-    """Read the evidence of what was learnt, (N,) float32, unless a version that did not keep it saved the state."""
+    """Read the evidence of the codes, (N,) float32; None for a state of an older version, which has none."""
     if "evidence" not in file.names:
         return None
     evidence = file.expect("evidence", np.float32, (num_gaussians,))

@@ -1,9 +1,9 @@
 """Mask reliability: the share of each view's labelled pixels whose label the other views predict.
 
-Probabilities that were fitted to a mask agree with its errors, so a mask is compared with a rendering of what was
-learnt without it (`Learner.predict_without`). The share estimates how many of its labels are right. Of a soft mask, a
-pixel's label is its largest share; in a partial one "none of those looked for" is a label too, and right where a class
-is predicted that was not looked for.
+Probabilities that were fitted to a mask agree with its errors. So each mask is compared with a rendering of
+probabilities that were learnt without it (`Learner.predict_without`). The share estimates how many of its labels are
+right. In a soft mask, the label of a pixel is its likeliest class. In a partial mask, "none of the classes looked for"
+is also a label, and it is right if the predicted class was not looked for.
 """
 
 from __future__ import annotations
@@ -31,51 +31,51 @@ from gsseg_core.raster.view_renderer import NO_PIXELS
 from gsseg_core.scene.camera import Camera
 from gsseg_core.several_at_once import each_with_made, several_at_once
 
-WORST = 4  # views that are trusted least, as pictures show them
-_LARGE = 1 << 17  # px: of a larger view, every third tile is compared
+WORST = 4  # number of least reliable views that are shown in pictures
+_LARGE = 1 << 17  # px; every third tile of a larger view is compared
 _TILE = 16  # px a side
 
 Cells = tuple[np.ndarray, np.ndarray, np.ndarray]
-"""Counts that are not 0: class predicted, label, and pixels, (Z,) int64 each."""
+"""Non-zero counts: predicted class, label, and number of pixels, (Z,) int64 each."""
 
 
 @dataclass(frozen=True, eq=False)
 class ViewCheck:
-    """Comparison of a view's mask with what the other views predict.
+    """Comparison of a view's mask with the prediction of the other views.
 
-    In `counts` are the pixels with a label of which there is a prediction, by class predicted (row) and label (column);
-    of thousands of classes, few are taken for each other.
+    `counts` is a confusion matrix: the labelled pixels with a prediction, by predicted class (row) and label (column).
+    It is sparse, because few of thousands of classes are confused.
     """
 
     name: str
     num_pixels: int  # with a label
-    classes: np.ndarray  # (L,) int32: labels in the mask, ascending; in a partial one, "none of these" (-1) at last
-    counts: CSRRows  # K rows of int64, L columns; none of them 0
-    predicted: PackedLabels | None = None  # (H, W): what the other views predict, for pictures
+    classes: np.ndarray  # (L,) int32: labels in the mask, ascending; a partial mask has "none of these" (-1) last
+    counts: CSRRows  # K rows of non-zero int64, L columns
+    predicted: PackedLabels | None = None  # (H, W): prediction of the other views, for pictures
     evidence: LabelEvidence | None = None  # of a soft or partial mask; `classes` are its vocabulary
     rejected: float = 0.0  # `Learner.rejected_share`
-    # (C,) int32: classes that the border of the image cuts; mask and prediction agree on some of its pixels.
+    # (C,) int32: classes cut off by the image border: those with border pixels where mask and prediction agree.
     cut: np.ndarray = field(default_factory=lambda: np.empty(0, np.int32))
 
     @property
     def checked(self) -> int:
-        """Pixels with a label of which there is a prediction."""
+        """Number of labelled pixels with a prediction."""
         return int(self.counts.data.sum())
 
     @property
     def reliability(self) -> float:
-        """Share of the checked pixels whose label is the one predicted, in [0, 1]; NaN where there is none."""
+        """Share of the checked pixels whose label is the predicted one, in [0, 1]; NaN if no pixel was checked."""
         return float(self.counts.data[self._right].sum() / self.checked) if self.checked else math.nan
 
     def prediction(self) -> np.ndarray:
-        """Unpack what the other views predict, (H, W) int32."""
+        """Unpack the prediction of the other views, (H, W) int32."""
         assert self.predicted is not None, f"check of {self.name} came without its prediction"
         return self.predicted.unpack()
 
     def completed(self, mask: np.ndarray) -> np.ndarray:  # (H, W) int32
-        """Give what is predicted, and a guess where nothing is, as in most tiles of a large view; (H, W) int32.
+        """Return the prediction, with a guess where there is none, as in most tiles of a large view; (H, W) int32.
 
-        The guess is the label of the mask if that is predicted a tile further on, in any direction, else what is.
+        The guess is taken from the predictions one tile away: the label of the mask if one of them has it, else any.
         """
         predicted = self.prediction()
         unknown = predicted == UNKNOWN
@@ -83,7 +83,7 @@ class ViewCheck:
             return predicted
         around = np.pad(predicted, _TILE, constant_values=UNKNOWN)
         inside, before, behind = slice(_TILE, -_TILE), slice(None, -2 * _TILE), slice(2 * _TILE, None)
-        # Tiles that are compared lie on diagonals: in these directions, each of the others has three of them beside it.
+        # Compared tiles lie on diagonals: in these six directions, each other tile has three compared ones next to it.
         straight = (inside, before), (inside, behind), (before, inside), (behind, inside)
         for place in (*straight, (before, behind), (behind, before)):
             beside = around[place]
@@ -91,13 +91,13 @@ class ViewCheck:
         return predicted
 
     def cells(self) -> Cells:
-        """List the counts that are not 0, of labels that are classes."""
+        """List the non-zero counts of labels that are classes."""
         labels = self.classes[self.counts.indices].astype(np.int64)
         named = labels >= 0
         return self.counts.rows[named], labels[named], self.counts.data[named]
 
     def confusions(self, count: int = 3) -> list[tuple[int, int, float]]:
-        """List what was most often taken for something else: class predicted, label seen, share of checked pixels."""
+        """List the most frequent confusions: predicted class, label in the mask, share of checked pixels."""
         wrong = np.flatnonzero(~self._right)
         largest = wrong[np.argsort(-self.counts.data[wrong], kind="stable")[:count]]
         predicted, labels = self.counts.rows[largest].tolist(), self.classes[self.counts.indices[largest]].tolist()
@@ -105,7 +105,7 @@ class ViewCheck:
 
     @property
     def _right(self) -> np.ndarray:
-        """Which of the counts are of pixels whose label is the one predicted, (Z,) bool."""
+        """Mark the counts of pixels whose label is the predicted one, (Z,) bool."""
         own = np.full(self.counts.num_rows, UNKNOWN)
         classes, words = (self.evidence or LabelEvidence(self.classes)).correct_words(len(own))
         own[classes] = words
@@ -113,23 +113,23 @@ class ViewCheck:
 
 
 def sum_cells(cells: Sequence[Cells]) -> Cells:
-    """Add up the cells of some views; in the order of the classes predicted, and of the labels for each."""
+    """Add up the cells of some views; the result is sorted by predicted class, then by label."""
     predicted, labels, pixels = map(np.concatenate, zip(*cells, strict=True))
     pairs, place = np.unique(predicted << 32 | labels, return_inverse=True)
     return pairs >> 32, pairs & 0xFFFFFFFF, np.bincount(place, pixels).astype(np.int64)
 
 
 class MaskChecker:
-    """Compares masks of a learner, after `fit`, with what it predicts without learning from them; it must not go on."""
+    """Compares masks of a learner, after `fit`, with its prediction without them; the learner must not change after."""
 
     def __init__(self, learner: Learner) -> None:
         self.learner = learner
         self._sampled = {view.name for view in spread(list(learner.views.values()), VIEWS)}
         self._samples: dict[str, Sample] = {}
-        self.sampled_checks: dict[str, ViewCheck] = {}  # by name of the view, of those that `sample` was asked for
+        self.sampled_checks: dict[str, ViewCheck] = {}  # by name, for views that were passed to `sample`
 
     def sample(self, view: View) -> Sample:
-        """Take pixels of a view's mask with their predicted probabilities, to fit the temperature to."""
+        """Return pixels of a view's mask with their predicted probabilities, for the fit of the temperature."""
         if view.name not in self._samples:
             self._sampled.add(view.name)
             self.sampled_checks[view.name] = self._check(view)
@@ -138,8 +138,9 @@ class MaskChecker:
     def check_all(self, progress: Progress = silent) -> list[ViewCheck]:
         """Compare all masks with their predictions, in the order of the views.
 
-        A prediction is unknown where most of a ray ends on Gaussians that only this view has seen; and, but for the
-        `shown_views`, where the mask says nothing, and in two of three tiles of 16 x 16 pixels of a large view.
+        A prediction is unknown where most of a ray ends on Gaussians that only this view has seen. To save time, it is
+        also unknown where the mask has no label, and in two of three tiles of 16 x 16 pixels of a large view; views in
+        `shown_views` are predicted completely.
         """
         views, device = self.learner.views, self.learner.device
         checked = each_with_made(self._check, views.values(), device, progress, "check views")
@@ -152,7 +153,7 @@ class MaskChecker:
         return list(checks.values())
 
     def _check(self, view: View) -> ViewCheck:
-        """Compare a view's mask with what is predicted where it says something."""
+        """Compare a view's mask with its prediction at labelled pixels."""
         learner, seen, is_sampled = self.learner, view.read_seen(), view.name in self._sampled
         wanted = _compared(seen.labels)
         grid = grid_of(view.camera.height, view.camera.width) if is_sampled else NO_PIXELS
@@ -165,28 +166,28 @@ class MaskChecker:
         return replace(check, rejected=learner.rejected_share(view))
 
     def _everywhere(self, view: View) -> PackedLabels:
-        """Tell the class of each pixel of a view that is shown, also where nothing is compared."""
+        """Predict the class of every pixel of a view that is shown, also of pixels that are not compared."""
         labelled = view.read_seen().labels >= 0
         return PackedLabels(self.learner.strongest_without(view, labelled if labelled.all() else None).labels())
 
 
 def _is_of_all(check: ViewCheck, camera: Camera) -> bool:
-    """Tell whether all pixels of a view were compared."""
+    """Return whether all pixels of a view were compared."""
     return check.num_pixels == camera.width * camera.height <= _LARGE
 
 
 def _compared(labels: np.ndarray) -> np.ndarray:  # (H, W)
-    """Choose the pixels of a mask that are compared, (H, W) bool: large masks tell enough by a third of them."""
+    """Choose the pixels of a mask to compare, (H, W) bool: for large masks a third of them is enough."""
     wanted: np.ndarray = labels >= 0
     if wanted.size > _LARGE:
-        # Those on the main diagonal are among them, and so is some of every grid of `grid_of`, whatever its step.
+        # The tiles on the main diagonal are included, and so every grid of `grid_of` has compared pixels.
         rows, columns = (np.arange(size) // _TILE % 3 for size in wanted.shape)
         wanted &= np.equal.outer(rows, columns)
     return wanted
 
 
 def worst_views(checks: Iterable[ViewCheck], count: int | None = None) -> list[ViewCheck]:
-    """Sort views by reliability, the worst first; those that nothing is known of come last. All, or so many at most."""
+    """Sort views by reliability, worst first and unchecked ones last; return all, or the first `count`."""
     return sorted(checks, key=lambda check: (not check.checked, check.reliability))[:count]
 
 
@@ -198,18 +199,18 @@ def ranked_examples(checks: Iterable[ViewCheck]) -> list[tuple[str, ViewCheck]]:
 
 
 def shown_views(checks: Iterable[ViewCheck]) -> list[ViewCheck]:
-    """Choose the views whose masks and predictions are shown to people."""
+    """Choose the views whose masks and predictions are shown in pictures: the worst and the ranked examples."""
     shown = {check.name: check for check in worst_views(checks, WORST)}
     shown |= {check.name: check for _, check in ranked_examples(checks)}
     return list(shown.values())
 
 
 def reliability_report(checks: Iterable[ViewCheck], class_names: Mapping[int, str]) -> list[dict[str, Any]]:
-    """Reliability of each view for `report.json`, the worst first.
+    """Return the reliability of each view for `report.json`, worst first.
 
-    Of each its `name`; `reliability` in [0, 1], None where there is no prediction; `num_pixels` with a label;
-    `rejected_share`, the share of them whose label was rejected; and `confusions`, the largest first: `true`, the class
-    that the others predict, `seen` as, and the `share` of the view's checked pixels.
+    Each entry has the view's `name`; `reliability` in [0, 1], None if there is no prediction; `num_pixels`, the number
+    of labelled pixels; `rejected_share`, the share of these whose label was rejected; and `confusions`, largest first:
+    `true`, the class that the other views predict; `seen`, the label in the mask; and `share` of the checked pixels.
     """
 
     def name(label: int) -> str:
@@ -234,7 +235,7 @@ def compare_mask(
 ) -> ViewCheck:  # fmt: skip
     """Compare a view's mask with any prediction of its labels, `UNKNOWN` (-1) where there is none.
 
-    The mask is read, unless it is at hand. Raises `MaskFormatError` for a prediction of another size or other classes.
+    The mask is read if `seen` is None. Raises `MaskFormatError` for a prediction of another size or other classes.
     """
     seen = seen or view.read_seen()
     labels, evidence = seen.named(), seen.evidence
@@ -260,10 +261,10 @@ def compare_mask(
 
 
 def _occurring(labels: np.ndarray, count: int) -> tuple[np.ndarray, np.ndarray]:  # (H, W)
-    """Find which of `count` classes occur, (C,) ascending, and the place of each class among these, (count + 1,).
+    """Find which of `count` classes occur, (C,) ascending, and the position of each class among these, (count + 1,).
 
-    Those that do not have -1 for a place, and so has `UNKNOWN`, at last. A table of all names would take gigabytes
-    where there are tens of thousands.
+    The position is -1 for classes that do not occur, and for `UNKNOWN`, the last entry. Only classes that occur get a
+    row in the confusion matrix: with tens of thousands of classes, a matrix of all would take gigabytes.
     """
     occurs = np.zeros(count + 1, np.bool_)
     _mark(labels, occurs)
@@ -274,7 +275,7 @@ def _occurring(labels: np.ndarray, count: int) -> tuple[np.ndarray, np.ndarray]:
 
 
 @kernel
-def _mark(labels: np.ndarray, occurs: np.ndarray) -> None:  # (H, W), of which -1 is the last place; out
+def _mark(labels: np.ndarray, occurs: np.ndarray) -> None:  # (H, W), -1 indexes the last entry; out
     for y in range(labels.shape[0]):
         for x in range(labels.shape[1]):
             occurs[labels[y, x]] = True
@@ -283,12 +284,13 @@ def _mark(labels: np.ndarray, occurs: np.ndarray) -> None:  # (H, W), of which -
 @kernel
 def _count_pixels(
     predicted: np.ndarray, labels: np.ndarray, seen: np.ndarray,  # (H, W) each
-    row: np.ndarray, column: np.ndarray,  # (K + 1,), (W + 1,): place of each among those that occur
+    row: np.ndarray, column: np.ndarray,  # (K + 1,), (W + 1,): positions from `_occurring`
     table: np.ndarray,  # (R + 1, C + 2) out
 ) -> None:  # fmt: skip
-    """Count pixels by class predicted, the first row for none, and by label.
+    """Count pixels by predicted class (first row: none) and by label.
 
-    Where a partial mask names no class, it may say "none of these", the last column but one, and else nothing.
+    Pixels of a partial mask that name no class count in the last column but one if they have the label "none of these",
+    and in the last column if they have no label.
     """
     width = table.shape[1] - 2
     for y in range(labels.shape[0]):

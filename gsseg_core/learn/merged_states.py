@@ -1,4 +1,4 @@
-"""States of one scene added up: what several robots have learnt, as if all masks had come to one of them."""
+"""Merges saved states of one scene, so that several robots get the result of one robot with all their masks."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from gsseg_core.scene.living_scene import LivingScene
 
 
 class Saved(NamedTuple):
-    """A state, and what errors call it."""
+    """A state with its scene and the name that errors use for it."""
 
     source: str  # its file, or "the session"
     scene: str  # digest of its scene
@@ -28,18 +28,24 @@ class Saved(NamedTuple):
 def merge_states(
     saved: Sequence[Saved], without: Callable[[State, tuple[str, ...], bool], State] | None = None
 ) -> State:
-    """Add up states of one scene, at least one: votes exactly, views one after the other, class names together.
+    """Add up one or more states of one scene: sum the votes exactly, append the views, and unite the class names.
 
-    Views of the same name are told apart: the later one is called like "view_2". Codes that were learnt are those of
-    the views of one state, and go.
+    If two views have the same name, the later one gets a name like "view_2". Learnt codes are dropped, since those of a
+    state are only learnt from its own views.
 
-    `without` takes views, by name, and their votes out of a state, and with True all those that it no longer keeps.
-    With it, a view that several states keep counts once; otherwise as often as they keep it, as without the scene
-    nobody knows its votes. Views that a state no longer keeps count once if those before it know all of them, or none.
+    `without(state, names, all_dropped)` removes views, by name, and their votes from a state; if `all_dropped`, it also
+    removes the votes of all views that the state no longer keeps. With this function, a view that several states keep
+    counts once. Without it, the view counts as often as states keep it, since its votes are unknown without the scene.
+    Views that a state no longer keeps count once if the states before it know all of them, or none of them.
 
-    Raises `StateMismatchError` where they are of different scenes, and `StateFileError` where they have different names
-    for one class, or ids that each session gave to the objects that it found; where one brings no view that one before
-    it has not, and would count twice; or where some have votes of whole rays, and some have not.
+    Raises
+    ------
+    StateMismatchError
+        The states are of different scenes.
+    StateFileError
+        States have different names for one class; or class ids that each session gave to the objects that it found; or
+        votes of whole rays in some but not all states. Or all views of one state are already in an earlier one, so
+        they would count twice.
     """
     first = saved[0]
     names: dict[int, str] = {}
@@ -62,7 +68,7 @@ def merge_states(
                 name = f"{view.name}_{count}"
             views[name] = view if name == view.name else _renamed(view, name)
     num_classes = max(one.state.num_classes for one in saved)
-    # One state alone stays of its kind.
+    # `replace` keeps the other fields of the first state, so a single state keeps its `per_view`.
     return replace(
         first.state, votes=votes.nonzero(), num_classes=num_classes, views=[*views.values()], num_fused=num_fused,
         class_names=dict(sorted(names.items())), learnt=None, dropped=dropped,
@@ -70,7 +76,7 @@ def merge_states(
 
 
 def _check_fits(saved: Sequence[Saved], number: int, names: Mapping[int, str]) -> None:
-    """Raise where one of the states cannot be added to those before it, which have these names of classes."""
+    """Raise if state `number` cannot be added to those before it, whose class names are `names`."""
     one, first = saved[number], saved[0]
     if one.scene != first.scene or not _is_same_map(one.state.living, first.state.living):
         raise StateMismatchError(
@@ -97,12 +103,12 @@ def _check_fits(saved: Sequence[Saved], number: int, names: Mapping[int, str]) -
 
 
 def _renamed(view: View, name: str) -> View:
-    """Give a view another name; it keeps the one that its robot knows it by."""
+    """Rename a view, and keep the name that its robot uses as its former name."""
     return replace(view, camera=replace(view.camera, name=name), former_name=view.first_name)
 
 
 def _is_same_map(one: LivingScene | None, other: LivingScene | None) -> bool:
-    """Whether two states hold their views in the same frames; without a scene of their own, in that of the scene."""
+    """Return whether two states have their views in the same frames; None: the state has no changing scene."""
     if one is None or other is None or one is other:
         return one is other
     return (
@@ -111,7 +117,7 @@ def _is_same_map(one: LivingScene | None, other: LivingScene | None) -> bool:
 
 
 def _brings_nothing(one: State, other: State) -> bool:
-    """Whether another state holds all views of a state, or the same votes where no views are kept."""
+    """Return whether `other` has all views of a state, or the same votes if the state keeps no views."""
     if not len(one.votes.data):
         return False
     if not one.views:
@@ -122,14 +128,14 @@ def _brings_nothing(one: State, other: State) -> bool:
 
 
 def digests(state: State) -> list[bytes]:
-    """List the views in the votes of a state, as far as it knows them."""
+    """List the digests of the views in the votes of a state, as far as the state has them."""
     return [*(view.digest for view in state.views), *state.dropped]
 
 
 def shared_views(state: State, known: Counter[bytes]) -> tuple[tuple[str, ...], bool]:
-    """Name the views of a state that are among those known, and tell whether there are others, all known, too.
+    """Return the names of the views of a state that are `known`, and whether all its dropped views are known, too.
 
-    Each that is known stands for one: a camera that stands still has several alike.
+    Each known view matches only one view, because a camera that stands still has several identical ones.
     """
     left, shared = known.copy(), []
     for view in state.views:

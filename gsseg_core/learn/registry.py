@@ -1,4 +1,4 @@
-"""The table of learners: from it come the command line's choices, the node's, the report's and the errors' lists."""
+"""The table of learners, which the command line, the node, the report and error messages use."""
 
 from __future__ import annotations
 
@@ -15,10 +15,10 @@ if TYPE_CHECKING:
 
 
 class Entry(NamedTuple):
-    """Where the classes of a learner are, as "module:class": they are imported when one is made."""
+    """The classes of a learner as "module:class", imported only when the learner is made."""
 
     learner: str  # a subclass of `gsseg_core.learn.learner.Learner`
-    distributed: str = ""  # the same on the workers of a Dask cluster, which it takes first; "" if it cannot be
+    distributed: str = ""  # its variant for a Dask cluster, with the client as first argument; "" if there is none
 
 
 LEARNERS = {
@@ -34,12 +34,12 @@ DEFAULT = next(iter(LEARNERS))
 
 
 def distributed_learners() -> list[str]:
-    """Names of the learners that sum over views, and so can do it on many machines."""
+    """Return the names of the learners that can run on many machines because they sum over views."""
     return [name for name, entry in LEARNERS.items() if entry.distributed]
 
 
 def check_learner(name: str, scheduler: str | None = None) -> None:
-    """Raise `SettingsError` if there is no such learner, or it cannot learn on the workers of this scheduler."""
+    """Raise `SettingsError` if there is no such learner, or if it cannot use a scheduler that is given."""
     if name not in LEARNERS:
         raise SettingsError(f"learner is {name!r}; expected one of {', '.join(LEARNERS)}")
     if scheduler is not None and not LEARNERS[name].distributed:
@@ -51,7 +51,7 @@ def check_learner(name: str, scheduler: str | None = None) -> None:
 
 
 def check_seed(seed: int) -> None:
-    """Raise `SettingsError` if random numbers cannot begin with it."""
+    """Raise `SettingsError` if the seed is negative, which random generators do not accept."""
     if seed < 0:
         raise SettingsError(f"seed is {seed}; expected at least 0")
 
@@ -60,10 +60,10 @@ def make_learner(
     name: str, scene: GaussianScene, num_classes: int, *,
     max_steps: int | None = None, seed: int = 0, client: Client | None = None, **where: Any,
 ) -> Learner:  # fmt: skip
-    """Make one of `LEARNERS` by its name, with its default settings; `SettingsError` if there is no such learner.
+    """Make one of `LEARNERS` by its name, with default settings; `SettingsError` if there is no such learner.
 
-    `max_steps` and `seed` are as `Learner.default_settings` takes them, `where` is `device` and `memory_budget` as
-    `Learner` does. With a `client`, the workers of its Dask cluster learn, if the learner can be distributed.
+    `max_steps` and `seed` go to `Learner.default_settings`, `where` (`device` and `memory_budget`) to `Learner`. With a
+    `client`, a learner that can be distributed runs on the workers of its Dask cluster.
     """
     check_learner(name)
     distributed = LEARNERS[name].distributed if client is not None else ""

@@ -1,4 +1,4 @@
-"""Ids that name one object, as where a tracker lost it and named it anew, or where two names mean one thing."""
+"""Finds several ids of one object, as when a tracker lost it and gave it a new id, or two class names are synonyms."""
 
 from __future__ import annotations
 
@@ -10,16 +10,17 @@ from gsseg_core.data.class_names import NOTED, class_name, listed
 from gsseg_core.learn.mask_reliability import MaskChecker, ViewCheck, sum_cells
 from gsseg_core.text import clipped, counted
 
-RENAMED = 0.25  # share of an id's pixels from which on it is one of several; where ids hold, next to none are
+RENAMED = 0.25  # report an id if others name more than this share of its pixels; almost 0 where ids are stable
 
 
 def renamed_ids(checks: Sequence[ViewCheck], others: Iterable[np.ndarray] = ()) -> dict[int, int]:
-    """Find ids of which the other views give many pixels to ids that no mask shows beside them, the background apart.
+    """Find ids for which the other views predict, in many pixels, another id that no mask shows together with it.
 
-    Two objects are sooner or later seen together, names of one object never. An id of a single view is left out: the
-    other views do not know it. `others` are masks (H, W) that were not checked, and show ids together all the same.
+    Two objects are eventually seen together; two ids of one object never are. The background is left out, and so are
+    ids in only one view, which other views cannot predict. `others` are further masks (H, W), not checked, that also
+    show which ids occur together.
 
-    Returns, by each such id, ascending, the one of these that most pixels are given to.
+    Returns a map from each such id, ascending, to the other id that most of its pixels get.
     """
     cells = [check.cells() for check in checks]
     given, label, counts = sum_cells(cells)
@@ -36,14 +37,14 @@ def renamed_ids(checks: Sequence[ViewCheck], others: Iterable[np.ndarray] = ()) 
 
 
 def renamed_among_samples(checker: MaskChecker) -> dict[int, int]:
-    """Find `renamed_ids` by the masks that were sampled for calibration; others are read only if some seem to be."""
+    """Find `renamed_ids` in the masks sampled for calibration; read the other masks only if these have any."""
     checks, sampled = list(checker.sampled_checks.values()), checker.sampled_checks
     others = (view.read_seen().named() for name, view in checker.learner.views.items() if name not in sampled)
     return renamed_ids(checks, others) if renamed_ids(checks) else {}
 
 
 def renamed_report(renamed: Mapping[int, int], class_names: Mapping[int, str]) -> list[dict[str, str]]:
-    """List `renamed_ids` for `report.json`: the `name` of each, and what the `others_say`."""
+    """List `renamed_ids` for `report.json`: the `name` of each id, and the name that `others_say`."""
     return [
         {"name": class_name(class_names, k), "others_say": class_name(class_names, other)}
         for k, other in renamed.items()
@@ -53,7 +54,7 @@ def renamed_report(renamed: Mapping[int, int], class_names: Mapping[int, str]) -
 def renamed_note(
     renamed: Sequence[Mapping[str, str]], per_view: str, label_map: str, written: Callable[[str], str] = clipped
 ) -> str:
-    """Say in a sentence without its stop what a `renamed_report` lists, and which two settings help; "" for nothing."""
+    """Write a `renamed_report` as a sentence without full stop, with two settings that help; "" if it is empty."""
     if not renamed:
         return ""
     pairs = listed((f"{entry['name']} ({entry['others_say']})" for entry in renamed), NOTED, written)

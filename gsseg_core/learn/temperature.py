@@ -1,20 +1,21 @@
-"""Temperature scaling: probabilities that are right as often as they claim.
+"""Temperature scaling: turns blended shares into probabilities that are right as often as they claim.
 
-What a view blends is a share, not a probability. A pixel at an edge that is made to 0.7 of Gaussians of one object
-belongs to it far more often than in seven cases of ten; and the pixels of one view are no independent witnesses: a
-Gaussian of which 0.7 of all pixels say the same has most views on its side, and each view counts about once. Both are
-mended by one number. With the temperature T, shares O[k] become
+A view blends shares, not probabilities, for two reasons. A pixel at an edge that consists to 0.7 of Gaussians of one
+object belongs to it in far more than seven of ten cases. And pixels of one view are not independent: if 0.7 of all
+pixels of a Gaussian have one label, most views agree on it, and each view counts about once. A single number, the
+temperature T, corrects both. It changes shares O[k] to
 
     P[k] = O[k]^(1/T) / sum_j O[j]^(1/T)
 
-(temperature scaling of log O; Guo et al., On Calibration of Modern Neural Networks, ICML 2017). Their order stays, and
-so do all labels. The temperature is fitted to masks that the codes have not learnt from (`gsseg_core.learn.calibrate`).
-A mask may be wrong, while what is wanted is the probability of the true class, so what is maximised is the likelihood
+(temperature scaling of log O; Guo et al., On Calibration of Modern Neural Networks, ICML 2017). The order of classes
+stays the same, and so do all labels. The temperature is fitted to masks that the codes were not learnt from
+(`gsseg_core.learn.calibrate`). P is meant to be the probability of the true class, but a mask may be wrong. So
+the fit maximises the log-likelihood
 
     sum_v sum_p log sum_k P_v[p, k] C_v[k, y_p]
 
-with a confusion matrix per view, C_v[true, seen], learnt at every temperature that is tried, in `STEPS` steps of
-expectation-maximisation, with a prior of `RIGHT` times the pixels of each class in which the segmenter was right.
+with a confusion matrix C_v[true, seen] per view. It is learnt at every temperature that is tried, in `STEPS` steps of
+expectation maximisation, with a prior of `RIGHT` times the pixels of each class for correct labels.
 """
 
 from __future__ import annotations
@@ -31,16 +32,16 @@ from gsseg_core.kernels.compiler import kernel
 from gsseg_core.raster.view_renderer import PixelGrid
 
 LOWEST, HIGHEST = 0.2, 5.0  # temperatures that are tried
-VIEWS = 16  # views whose masks the temperature is fitted to, at most
-PIXELS = 2048  # pixels of each view that the temperature is fitted to, on a grid, at most about
+VIEWS = 16  # most views to whose masks the temperature is fitted
+PIXELS = 2048  # most pixels of each view to which the temperature is fitted, on a grid
 
 STEPS = 5
 RIGHT = 0.3
 OUTLIERS = 1e-3  # share of pixels that carry any label of the view by chance
 _PRECISION = 0.02  # of the logarithm of the temperature
-_TINY = 1e-12  # likelihood of a label, at least
-_LEAST = np.finfo(np.float32).tiny  # in place of 0 as a divisor
-_SMALLEST = float(_LEAST)  # temperatures are above it, and below its reciprocal
+_TINY = 1e-12  # lower limit of the likelihood of a label
+_LEAST = np.finfo(np.float32).tiny  # lower limit of divisors, instead of 0
+_SMALLEST = float(_LEAST)  # temperatures must be above this and below its reciprocal
 
 
 def tempered(
@@ -49,9 +50,9 @@ def tempered(
 ) -> np.ndarray:
     """Raise shares to the power of 1 / temperature, and scale each row back to its sum: (..., K) float32.
 
-    Below 1 the largest gains, above 1 the others do. The order in a row stays, zeros stay zeros. At 1 the very same
-    array is returned; else no entry is above 1. Going to a temperature and then to its reciprocal leads back, up to
-    rounding and to entries that are too small for the type. Raises `SettingsError` for what is no temperature.
+    A temperature below 1 increases the largest entry, one above 1 the others. The order in a row stays, and zeros stay
+    zeros. At 1 the same array is returned; else no entry is above 1. Applying a temperature and then its reciprocal
+    restores the shares, up to rounding and underflow. Raises `SettingsError` for an invalid temperature.
     """
     if temperature == 1:
         return shares
@@ -60,7 +61,7 @@ def tempered(
 
 
 def tempered_rows(shares: CSRRows, temperature: float) -> CSRRows:
-    """Do with sparse shares, float32, what `tempered` does; zeros take neither memory nor time."""
+    """Apply `tempered` to sparse shares, float32, without memory or time for zeros."""
     if not _SMALLEST < temperature < 1 / _SMALLEST:
         raise SettingsError(f"temperature is {temperature}; expected a number above 0 that float32 can hold")
     return shares if temperature == 1 else shares.with_data(_powers(shares, np.float32(temperature)))
@@ -76,25 +77,25 @@ def _powers(rows: CSRRows, temperature: np.float32) -> np.ndarray:
             known += data[z]
             peak = max(peak, data[z])
         for z in range(indptr[i], indptr[i + 1]):
-            # The logarithm of 0 is minus infinity, of which any power is 0 again.
+            # For a share of 0 this is exp(-inf), which is 0 at any temperature.
             out[z] = np.exp(np.log(data[z] / max(peak, _LEAST)) / temperature)
             total += out[z]
         for z in range(indptr[i], indptr[i + 1]):
-            # Rounding may take the only class of a row above the whole, and the whole above 1.
+            # Rounding could lift the only class of a row above the row's sum, and the sum above 1.
             out[z] = min(out[z] * (known / max(total, _LEAST)), min(known, np.float32(1)))
     return out
 
 
 class Sample(NamedTuple):
-    """Pixels of one view: predicted probabilities, and labels of its mask."""
+    """Sampled pixels of one view: predicted probabilities, and labels of its mask."""
 
     shares: np.ndarray  # (P, C) float32: of the C classes that occur in the prediction or the mask; rows sum to 1
     seen: np.ndarray  # (P,) int64: label of each pixel, as its column in `shares`, ascending
-    unknown: int  # pixels with a label of which little is predicted, and which are left out
+    unknown: int  # number of labelled pixels that are left out because little of them is predicted
 
 
 def grid_of(height: int, width: int) -> PixelGrid:
-    """Choose the pixels of a view that the temperature is fitted to."""
+    """Choose the grid of pixels of a view to which the temperature is fitted."""
     step = max(1, int(np.ceil(np.sqrt(height * width / PIXELS))))
     while -(-height // step) * -(-width // step) > PIXELS:
         step += 1
@@ -102,10 +103,10 @@ def grid_of(height: int, width: int) -> PixelGrid:
 
 
 def sample_grid(image: np.ndarray, labels: np.ndarray) -> Sample:
-    """Sample a view where label and prediction are known.
+    """Return the pixels of a view with known label and prediction, both given at the pixels of `grid_of`.
 
-    The image, (R, C, K), is blended of codes that have not seen the mask, (R, C) int32 and negative where unknown; both
-    are those of `grid_of`.
+    `image`, (R, C, K), is blended from codes that were learnt without the mask; `labels` are (R, C) int32, negative
+    where unknown.
     """
     shares, seen = image.reshape(-1, image.shape[2]), labels.ravel()
     total, labelled = shares.sum(axis=1), seen >= 0
@@ -114,7 +115,7 @@ def sample_grid(image: np.ndarray, labels: np.ndarray) -> Sample:
     known = known[np.argsort(seen[known], kind="stable")]
     seen, some = seen[known], shares.max(axis=0, initial=0) > 0
     some[seen] = True
-    columns = np.flatnonzero(some)  # Of thousands of classes a view shows some: the others are not copied.
+    columns = np.flatnonzero(some)  # Copy only classes that the view shows, out of maybe thousands.
     shares = shares[known[:, None], columns] / total[known, None]
     occurs = shares.max(axis=0, initial=0) > 1e-6
     occurs[np.searchsorted(columns, seen)] = True
@@ -123,9 +124,9 @@ def sample_grid(image: np.ndarray, labels: np.ndarray) -> Sample:
 
 
 def fit_temperature(samples: Sequence[Sample]) -> float:
-    """Fit the temperature at which held-out masks are likeliest, each seen through a confusion matrix of its own.
+    """Fit the temperature that maximises the likelihood of held-out masks, each with its own confusion matrix.
 
-    It is in [`LOWEST`, `HIGHEST`], and 1 where there is no pixel to go by.
+    It is in [`LOWEST`, `HIGHEST`], and 1 if the samples have no pixels.
     """
     known = [_Cells.of(sample) for sample in samples if len(sample.seen)]
     if not known:
@@ -139,9 +140,9 @@ def fit_temperature(samples: Sequence[Sample]) -> float:
 
 
 def golden_section(f: Callable[[float], float], low: float, high: float, precision: float) -> float:
-    """Find where a function with one minimum is least between two bounds, by sections in the golden ratio.
+    """Minimise a function with a single minimum between two bounds by golden-section search.
 
-    SciPy's search takes longer to load than this one takes to find.
+    Loading SciPy's search would take longer than this search.
     """
     kept = (5**0.5 - 1) / 2
     left, right = high - kept * (high - low), low + kept * (high - low)
@@ -159,14 +160,14 @@ def golden_section(f: Callable[[float], float], low: float, high: float, precisi
 
 
 class _Cells(NamedTuple):
-    """What is not 0 of the probabilities of a sample, and the cells of its confusion matrix that this meets.
+    """Sparse probabilities of a sample, and the cells of its sparse confusion matrix.
 
-    Of hundreds of classes, a pixel has a few, and a label is carried by pixels of a few.
+    A pixel has only a few of hundreds of classes, and a label occurs with only a few classes.
     """
 
-    shares: CSRRows  # P rows, Z entries in all
-    pixel: np.ndarray  # (Z,) int64: of each entry
-    cell: np.ndarray  # (Z,) int64: of the M cells
+    shares: CSRRows  # P rows, Z entries in total
+    pixel: np.ndarray  # (Z,) int64: pixel of each entry
+    cell: np.ndarray  # (Z,) int64: cell of each entry, one of M
     true: np.ndarray  # (M,) int64: class of each cell
     right: np.ndarray  # (L,) int64: for each label that occurs, the cell of its own class
     num_classes: int
@@ -181,11 +182,11 @@ class _Cells(NamedTuple):
 
 
 def _log_likelihood(cells: _Cells, temperature: float) -> float:
-    """Natural logarithm of the likelihood of a view's labels at a temperature, through its best confusion matrix."""
+    """Return the log-likelihood of a view's labels at a temperature, with its best confusion matrix, in nats."""
     shares, pixel, cell, true, right, num_classes = cells
     probabilities = tempered_rows(shares, temperature).data.astype(np.float64)
     prior = RIGHT * np.bincount(shares.indices, probabilities, num_classes)[true[right]]
-    # Rows sum to 1; those of classes that no label means have nothing on the diagonal.
+    # Rows sum to 1; classes that are no label of the mask have no diagonal entry.
     is_named = np.isin(true, true[right])
     confusion = np.where(is_named, 1 - RIGHT, 1.0) / len(right)
     confusion[right] += RIGHT

@@ -1,4 +1,4 @@
-"""Which views can be learnt from: the masks of these are read, and the others are rejected with a reason."""
+"""Reads the masks of views that can be learnt from, and rejects other views with a reason."""
 
 from __future__ import annotations
 
@@ -10,11 +10,11 @@ NO_MASK, SEES_NOTHING, ALL_UNKNOWN = "no mask", "sees no Gaussian", "all pixels 
 
 
 class UnusableViewError(Exception):
-    """A view that nothing can be learnt from; the message says why, in the words above."""
+    """Raised for a view from which nothing can be learnt; the message is one of the reasons above."""
 
 
 def read_mask(view: View, num_classes: int) -> SeenLabels:
-    """Read a view's mask; raise `UnknownLabelError` where it has labels beyond the classes, which have no votes."""
+    """Read a view's mask; raise `UnknownLabelError` if it has labels beyond the classes, which have no votes."""
     seen = view.read_seen()
     if seen.largest >= num_classes:
         raise UnknownLabelError(
@@ -25,7 +25,7 @@ def read_mask(view: View, num_classes: int) -> SeenLabels:
 
 
 def read_usable_mask(view: View, num_classes: int) -> SeenLabels:
-    """Read the mask of a view that is new, as `read_mask`; raise `UnusableViewError` where it tells nothing."""
+    """Read the mask of a new view, as `read_mask`; raise `UnusableViewError` if it has no mask or no labelled pixel."""
     if not view.has_mask:
         raise UnusableViewError(NO_MASK)
     seen = read_mask(view, num_classes)

@@ -1,4 +1,4 @@
-"""The learner by votes: class probabilities are the normalised sum over views of W^T onehot(y)."""
+"""The votes learner: class probabilities are the normalised sum over views of W^T onehot(y)."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from gsseg_core.scene.camera import Camera
 
 
 class VoteLearner(Learner):
-    """Class probabilities proportional to the votes. Exact, additive, one pass: what a live robot runs.
+    """Learner of class probabilities proportional to the votes: exact, additive, in one pass, for use on a robot.
 
     FlashSplat (Shen et al. 2024) takes the largest entry of the same sums.
     """
@@ -30,35 +30,35 @@ class VoteLearner(Learner):
         return self
 
     def move(self, name: str, camera: Camera) -> None:
-        """Have a view seen from another camera: its votes are taken back, and those from there are added.
+        """Change the camera of a view: subtract its votes, and add those from the new camera.
 
-        A view that sees nothing of the scene from there stays, without votes. On any error, nothing has changed.
+        A view that sees no Gaussian from there stays, without votes. After an error, nothing has changed.
         """
         before = self._observed(name)
         self._exchange(before, replace(before, camera=camera))
 
     def relabel(self, view: View) -> None:
-        """Have a view show other labels, seen from where it is: its operator is made once for both.
+        """Change the mask of a view, with the same camera; its operator is made once for both masks.
 
-        On any error, nothing has changed.
+        After an error, nothing has changed.
         """
         before, after = self._observed(view.name), view.held()
         self._exchange(before, after, self._operator_of(after))
 
     def checkpoint(self) -> Undo:
-        """Return what goes back to the present views and votes, after anything but `forget`."""
+        """Return a function that restores the present views and votes, unless `forget` was called."""
         prepared = self._prepared.emptied()
         return checkpoint(self, _votes=self._votes.copy(), views=dict(self.views), _prepared=prepared)
 
     def keep_last(self, count: int) -> None:
-        """Drop the oldest views and their masks, all but so many, of at least one; their votes stay."""
+        """Drop the oldest views and their masks, but keep the last `count`, at least 1; all votes stay."""
         old = list(self.views.values())[:-count]
         self.dropped += tuple(view.digest for view in old)
         for view in old:
             self.forget(view.name)
 
     def _exchange(self, before: View, after: View, operator: ViewOperator | None = None) -> None:
-        """Put a view in the place of one of its name, seen by the same operator if one is given."""
+        """Replace a view by one of the same name; both use `operator` if it is given."""
         self._lift(after, 1, operator)
         with all_or_nothing(partial(self._lift, after, -1, operator)):
             self._lift(before, -1, operator)
@@ -66,5 +66,5 @@ class VoteLearner(Learner):
         self._prepared.drop(after.name)
 
     def predict_without(self, view: View) -> np.ndarray:
-        """Blend into a view the votes of all others as probabilities, (H, W, K) float32; exact, by subtraction."""
+        """Render probabilities from the votes of all other views, (H, W, K) float32; exact, by subtraction."""
         return self._blend_codes(self.vote_rows_without(view.name), view)

@@ -1,6 +1,6 @@
-"""Vote resolution: signed votes become votes of at least 0, and what is voted against only is imputed.
+"""Vote resolution: converts signed votes to votes of at least 0, and imputes Gaussians with votes only against classes.
 
-Masks of some classes vote against those that they looked for and did not find (`gsseg_core.data.label_evidence`).
+Partial masks vote against classes that were looked for and not found (`gsseg_core.data.label_evidence`).
 """
 
 from __future__ import annotations
@@ -11,14 +11,14 @@ import numpy as np
 from gsseg_core.csr_rows import CSRRows
 from gsseg_core.kernels.compiler import called_by_kernels, kernel
 
-ROUNDS = 50  # of estimating how frequent classes are
+ROUNDS = 50  # EM steps that estimate the frequency of classes
 
 
 def resolved_votes(votes: CSRRows, possible: np.ndarray) -> CSRRows:  # int64; (K,) bool, ids that are classes
-    """Resolve signed votes into votes of at least 0; they stay as they are if none is negative.
+    """Resolve signed votes into votes of at least 0; votes without negative entries are returned unchanged.
 
     A class with more votes against it than for it is dropped. If all classes but one were looked for at a Gaussian,
-    that one is what "none of these" means, and gets as many votes as the class that was looked for least.
+    "none of these" means the remaining one, which gets as many votes as the class that was looked for least.
     """
     if votes.data.min(initial=0) >= 0:
         return votes
@@ -32,8 +32,8 @@ def resolved_votes(votes: CSRRows, possible: np.ndarray) -> CSRRows:  # int64; (
 def vote_shares(votes: CSRRows, possible: np.ndarray) -> CSRRows:  # int64; (K,) bool, ids that are classes
     """Divide the votes for classes by their sum: probabilities, float32; rows without votes stay empty.
 
-    Where all votes are against classes, the one class without any is certain; where several of the possible have none,
-    they share as `impute_probabilities` says.
+    If all votes of a row are against classes, and only one possible class has no votes, that class is certain. If
+    several have none, `impute_probabilities` divides the row among them.
     """
     counts, only = _count_shares(votes, np.flatnonzero(possible))
     shares = CSRRows.room_for(counts, np.float32)
@@ -48,11 +48,12 @@ def impute_probabilities(
     possible: np.ndarray,  # (K,) bool: ids that are classes
     rows: np.ndarray,  # (U,) Gaussians with votes only against classes, ascending
 ) -> CSRRows:
-    """Impute probabilities of Gaussians with votes only against classes: those that are left share them.
+    """Impute probabilities of Gaussians with votes only against classes, by dividing them among the other classes.
 
-    They do so in proportion to how frequent they are in the scene, on top of the probabilities that the row has from
-    its neighbours. The background is that to which no class applies, so its frequency is known only if every class was
-    looked for in some view. If one never was, only neighbours count, and without them the row stays zero: unknown.
+    Each of these gets the probability that the row already has from its neighbours, plus the frequency of the class in
+    the scene; the row is then scaled to sum 1. The background is what no class applies to. So frequencies are known
+    only if every class was looked for in some view. Otherwise only the neighbours count, and a row without them stays
+    zero (unknown).
     """
     left = codes.take(rows).dense(len(possible))
     candidates = _candidates(votes.take(rows), possible)
@@ -68,20 +69,21 @@ def impute_probabilities(
 
 
 def _candidates(votes: CSRRows, possible: np.ndarray) -> np.ndarray:  # U rows of int64, (K,) bool
-    """Mark the possible classes that Gaussians have no votes against, (U, K) bool."""
+    """Mark the possible classes against which a Gaussian has no votes, (U, K) bool."""
     candidates, against = np.tile(possible, (votes.num_rows, 1)), votes.data < 0
     candidates[votes.rows[against], votes.indices[against]] = False
     return candidates
 
 
 def _frequency(
-    known: np.ndarray,  # (K,) Gaussians of each class, as far as they are known
-    candidates: np.ndarray,  # (U, K) bool: what each of the others may be
+    known: np.ndarray,  # (K,) number of Gaussians with known class, by class
+    candidates: np.ndarray,  # (U, K) bool: classes that each of the other Gaussians may have
 ) -> np.ndarray:
-    """Estimate how frequent each class is, (K,): the likeliest proportions, by expectation maximisation.
+    """Estimate the frequency of each class, (K,): the likeliest proportions, by expectation maximisation.
 
-    One vote names an object, but the background takes a vote against every class. So it is too rare among the Gaussians
-    that are known, and what the others may be has to count. (Dempster, Laird & Rubin 1977, on grouped data.)
+    A single vote names an object, but background needs a vote against every class. So the background is too rare among
+    the known Gaussians, and the candidates of the others must count, too (Dempster, Laird & Rubin 1977, on grouped
+    data).
     """
     patterns, counts = np.unique(np.packbits(candidates, axis=1), axis=0, return_counts=True)
     may_be = np.unpackbits(patterns, axis=1, count=candidates.shape[1])
@@ -89,20 +91,20 @@ def _frequency(
     for _ in range(ROUNDS):
         frequency = known + counts @ _scaled(may_be * frequency)
         if not (total := frequency.sum()):
-            break  # None is known, and the others may be nothing: every class has votes against it.
+            break  # No class is known, and the others have no candidates: votes exclude every class.
         frequency /= total
     return frequency
 
 
 def _scaled(rows: np.ndarray) -> np.ndarray:  # (U, K)
-    """Scale rows to sum 1; rows of zeros stay zero."""
+    """Scale rows to the sum 1; rows of zeros stay zero."""
     total = rows.sum(axis=1, keepdims=True)
     return np.asarray(np.divide(rows, total, out=np.zeros_like(rows), where=total > 0))
 
 
 @kernel(parallel=True)
 def weigh_votes(votes: CSRRows) -> tuple[np.ndarray, np.ndarray]:
-    """Sum of the sizes of votes, int64, for and against classes, and the least of them and 0, (N,) int64 each."""
+    """Return the sum of absolute votes of each Gaussian, and the smallest of its votes and 0, (N,) int64 each."""
     indptr, _, data = votes
     total, least = np.zeros(indptr.shape[0] - 1, np.int64), np.zeros(indptr.shape[0] - 1, np.int64)
     for i in nb.prange(indptr.shape[0] - 1):
@@ -113,7 +115,7 @@ def weigh_votes(votes: CSRRows) -> tuple[np.ndarray, np.ndarray]:
 
 
 def is_resolved(votes: CSRRows, possible: np.ndarray) -> np.ndarray:  # int64; (K,) bool, ids that are classes
-    """Tell which Gaussians have a vote for a class, or only one class left, (N,) bool."""
+    """Mark the Gaussians that have a vote for a class, or only one possible class left, (N,) bool."""
     counts, _ = _count_shares(votes, np.flatnonzero(possible))
     return np.asarray(counts > 0)
 
@@ -122,7 +124,7 @@ def is_resolved(votes: CSRRows, possible: np.ndarray) -> np.ndarray:  # int64; (
 def _count_shares(votes: CSRRows, ids: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Count the classes of each Gaussian that have a share in its probabilities, (N,) int64.
 
-    Second comes the only class left of all, `ids`, where the votes are against all others, (N,) int32; else -1.
+    Also returns the only class of `ids` that is left if the votes are against all others, (N,) int32; else -1.
     """
     indptr, classes, data = votes
     counts, only = np.zeros(indptr.shape[0] - 1, np.int64), np.empty(indptr.shape[0] - 1, np.int32)
@@ -139,7 +141,7 @@ def _count_shares(votes: CSRRows, ids: np.ndarray) -> tuple[np.ndarray, np.ndarr
 
 @called_by_kernels
 def _only_class_left(classes: np.ndarray, votes: np.ndarray, ids: np.ndarray) -> int:
-    """Return the one of all classes `ids` that a row has no votes for or against; -1 if there are more, or none."""
+    """Return the only class of `ids` without votes for or against it in a row; -1 if there are several or none."""
     found, z = -1, 0
     for place in range(ids.shape[0]):
         while z < classes.shape[0] and (classes[z] < ids[place] or votes[z] == 0):
@@ -171,11 +173,11 @@ def _share(votes: CSRRows, only: np.ndarray, shares: CSRRows) -> None:
 
 @called_by_kernels
 def resolve_row(
-    classes: np.ndarray,  # (n,) of one row
-    votes: np.ndarray,  # (n,) int64, of it
-    ids: np.ndarray,  # of all classes, ascending
-    kept_classes: np.ndarray,  # out; capacity for all that is kept, n + 1 at most
-    kept_votes: np.ndarray,  # out, likewise
+    classes: np.ndarray,  # (n,) classes of one row
+    votes: np.ndarray,  # (n,) int64: their votes
+    ids: np.ndarray,  # ids of all classes, ascending
+    kept_classes: np.ndarray,  # out: the kept classes, with capacity for up to n + 1
+    kept_votes: np.ndarray,  # out: their votes, with the same capacity
 ) -> int:
     """Resolve the votes of one row as `resolved_votes` does; return the number of entries written."""
     least, against, n = 2**63 - 1, False, 0

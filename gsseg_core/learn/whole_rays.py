@@ -1,4 +1,4 @@
-"""Votes in states of an older version, whose rays went on behind surfaces, are cast anew as far as masks are kept."""
+"""Recomputes votes of an older version, whose rays went on behind surfaces, for all views whose masks are kept."""
 
 from __future__ import annotations
 
@@ -16,17 +16,17 @@ from gsseg_core.raster.view_operator import ViewOperator
 from gsseg_core.raster.vote_total import VoteTotal
 from gsseg_core.spatial.row_order import RowOrder
 
-_ROUNDING = 1e-3  # what is taken from a vote differs from what was added by at most this share: rounding makes 1e-5
+_ROUNDING = 1e-3  # largest relative difference between a subtracted and an added vote; rounding makes about 1e-5
 
 
 def votes_cast_anew(
     state: State, operator_of: Callable[[View], ViewOperator], used: Callable[[SeenLabels, ViewOperator], SeenLabels],
     order: RowOrder,
 ) -> VoteTotal:  # fmt: skip
-    """Return the votes of a state, in pages of an order; those of the views that it keeps by rays that end at surfaces.
+    """Return the votes of a state, in pages of an order, with rays of all kept views that end at surfaces.
 
-    Votes of views that are not kept stay as they are. Those that the kept views had cast are computed again and taken
-    from the sum. Rounding differs from when they were added, so what is left of a sum is 0 where it may be rounding.
+    Votes of views that are not kept stay unchanged. The old votes of kept views are computed again and subtracted from
+    the sum. Their rounding may differ from the original one, so small remainders of a sum are set to 0.
     """
     shape, all_kept = (state.votes.num_rows, state.num_classes), state.num_fused == len(state.views)
     left = VoteTotal(*shape, order) if all_kept else VoteTotal.from_rows(state.votes, state.num_classes, order)
@@ -44,8 +44,8 @@ def votes_cast_anew(
 
 
 def _take(left: VoteTotal, taken: VoteTotal, operator: ViewOperator, seen: SeenLabels) -> None:
-    """Take the votes of a view by whole rays from a sum; `taken` counts how many were, for or against."""
-    present = np.unique(seen.labels[seen.labels >= 0])  # Where the mask has evidence of its own, 0 to L - 1.
+    """Subtract the votes of a view by whole rays from `left`; add their absolute values to `taken`."""
+    present = np.unique(seen.labels[seen.labels >= 0])  # These are 0 to L - 1 if the mask has `evidence`.
     rows = (seen.evidence or LabelEvidence(present)).votes
     for first in range(0, len(present), CHANNELS):
         some = present[first : first + CHANNELS]
@@ -59,6 +59,6 @@ def _take(left: VoteTotal, taken: VoteTotal, operator: ViewOperator, seen: SeenL
 
 
 def _column(votes: np.ndarray, k: int) -> CSRRows:  # (N,)
-    """Give votes for one class as rows."""
+    """Return votes for one class as CSR rows."""
     cast = votes != 0
     return CSRRows(starts(cast), np.full(np.count_nonzero(cast), k, np.uint32), votes[cast])

@@ -1,4 +1,4 @@
-"""A connection to a Dask cluster that can do gsseg's work."""
+"""Connects to a Dask cluster, and checks that its workers have this version of gsseg."""
 
 from __future__ import annotations
 
@@ -17,16 +17,16 @@ from gsseg_core.errors import SchedulerError, SettingsError
 if TYPE_CHECKING:
     from distributed import Client
 
-PATIENCE = 30.0  # seconds to wait for a scheduler to answer, and for a worker when there is none
-UNREACHABLE = (OSError, TimeoutError, asyncio.TimeoutError)  # what Dask raises when nobody answers
+PATIENCE = 30.0  # s to wait for the answer of a scheduler, and for a worker if there is none
+UNREACHABLE = (OSError, TimeoutError, asyncio.TimeoutError)  # raised by Dask if there is no answer
 
 
 @contextmanager
 def connected(address: str) -> Iterator[Client]:
     """Connect to a Dask scheduler.
 
-    Raises `SettingsError` where Dask is not installed, or this is no address; `SchedulerError` where no scheduler
-    answers, it has no workers, or gsseg is missing there or is another version.
+    Raises `SettingsError` if Dask is not installed or the address is invalid; `SchedulerError` if no scheduler answers,
+    if it has no workers, or if gsseg is missing there or has another version.
     """
     if not re.fullmatch(r"(tcp://)?([^\s:/\[\]]+|\[[^\s/\[\]]+\]):\d{1,5}", address):
         raise SettingsError(f"scheduler is {address!r}; expected an address such as tcp://host:8786")
@@ -50,7 +50,7 @@ def connected(address: str) -> Iterator[Client]:
 
 @contextmanager
 def _silenced(logger: str) -> Iterator[None]:
-    """Keep what is raised as an error anyway out of Dask's log."""
+    """Silence a logger of Dask, whose messages repeat errors that are raised anyway."""
     log = logging.getLogger(logger)
     level = log.level
     log.setLevel(logging.CRITICAL + 1)
@@ -61,7 +61,7 @@ def _silenced(logger: str) -> Iterator[None]:
 
 
 def _check_scheduler(address: str) -> None:
-    """See whether a scheduler answers there; a client of Dask's that is refused or not answered waits for ever."""
+    """Check that a scheduler answers at this address, because Dask's client would wait for ever if none does."""
     from distributed.core import rpc
 
     async def ask() -> str:
@@ -74,10 +74,10 @@ def _check_scheduler(address: str) -> None:
     def wait() -> None:
         try:
             answers.append(asyncio.run(asyncio.wait_for(ask(), PATIENCE)))
-        except BaseException as error:  # Garbage is read as sizes, kinds and names: anything can come of it.
+        except BaseException as error:  # Garbage parsed as a Dask message can raise anything.
             answers.append(error)
 
-    # In a thread, since there may be a loop in this one; and Ctrl-C need not wait for it.
+    # In a thread, since this one may have an event loop, and so that Ctrl-C does not wait.
     with _silenced("distributed.core"):
         thread = threading.Thread(target=wait, daemon=True)
         thread.start()
@@ -98,10 +98,10 @@ def _no_scheduler(address: str, found: str) -> SchedulerError:
 
 
 def find_workers(client: Client) -> dict[str, int]:
-    """List the threads of each worker by its address; `SchedulerError` if none comes, or the scheduler is lost."""
+    """Return the threads of each worker by address; `SchedulerError` if none comes or the scheduler is lost."""
     deadline = time.monotonic() + PATIENCE
     while True:
-        late = time.monotonic() > deadline  # However long this process stood still, it looks once more.
+        late = time.monotonic() > deadline  # Before the query, so that a suspended process queries once more.
         try:
             workers = client.nthreads()
         except UNREACHABLE as error:
@@ -115,10 +115,10 @@ def find_workers(client: Client) -> dict[str, int]:
 
 
 def check_workers(client: Client, workers: Iterable[str]) -> None:
-    """See whether these workers have this version of gsseg; raise `SchedulerError` if not."""
+    """Raise `SchedulerError` if one of these workers does not have this version of gsseg."""
     asked = list(workers)
     for worker, found in (client.run(_probe(), workers=asked, on_error="return") if asked else {}).items():
-        if not isinstance(found, Exception):  # Else it was lost just now.
+        if not isinstance(found, Exception):  # Otherwise the worker was lost just now.
             _check_version(f"{name_of(client)}: worker {worker}", found)
 
 
@@ -131,7 +131,7 @@ def _check_version(where: str, found: str | None) -> None:
 
 
 def _probe() -> Callable[[], str | None]:
-    # Nested, so that it travels as code and not by its name, which means nothing where there is no gsseg.
+    # Nested, so that it is pickled as code: a worker without gsseg could not import it by name.
     def installed() -> str | None:
         from importlib.metadata import PackageNotFoundError, version
 
@@ -144,5 +144,5 @@ def _probe() -> Callable[[], str | None]:
 
 
 def name_of(client: Client) -> str:
-    """Return what messages call the scheduler."""
+    """Return the name of the scheduler for messages."""
     return f"scheduler {getattr(client.scheduler, 'address', '')}"

@@ -1,11 +1,11 @@
-"""Votes and EM on the workers of a Dask cluster: both are sums over views, and a sum can be taken anywhere.
+"""Votes and EM on the workers of a Dask cluster: both are sums over views, which workers can compute in parts.
 
-Each worker holds the geometry of the scene and its share of the views, prepared. In a step it gets the codes and the
-error models of its views. What it sums up meets the sums of the others pairwise, on the workers, in a tree whose root
-comes back here. These are sums of whole numbers, so they do not depend on who did what, and the result is the one of a
-single machine, bit for bit.
+Each worker has the geometry of the scene and its share of the views in prepared form. In a step it gets the codes and
+the error models of its views. The workers add their sums pairwise, in a tree whose root is returned to the client. The
+sums are sums of integers, so they do not depend on which worker did what: the result is bit for bit that of a single
+machine.
 
-Codes and error models are always here, too, so that whatever goes with a lost worker can be done again elsewhere.
+The client also keeps the codes and error models, so that work of a lost worker can be repeated elsewhere.
 """
 
 from __future__ import annotations
@@ -35,15 +35,15 @@ from gsseg_core.scene.gaussian_scene import GaussianScene
 if TYPE_CHECKING:
     from distributed import Client, Future
 
-ATTEMPTS = 5  # how often a sum is begun anew where Dask cannot make good by itself what was lost
+ATTEMPTS = 5  # attempts at a sum if Dask cannot recover lost data by itself
 _POLL = 0.01  # s
 
 Done = Callable[[int], None]
-"""Called with how many views are done, time and again."""
+"""Called repeatedly with the number of views that are done."""
 
 
 class _LostError(Exception):
-    """What a worker had is gone, or is to be sent in another way: begin anew."""
+    """Data of a worker is lost, or must be sent in another way: start again."""
 
 
 class _Share(NamedTuple):
@@ -53,7 +53,7 @@ class _Share(NamedTuple):
 
 
 class _OnWorkers(Learner):
-    """What the two learners below share: views are dealt to the workers, and sums over them come back."""
+    """Common base of the two learners below: it distributes views to workers, and collects sums over them."""
 
     def __init__(self, client: Client, scene: GaussianScene, num_classes: int, *rest: Any, **settings: Any) -> None:
         super().__init__(scene, num_classes, *rest, **settings)
@@ -64,13 +64,13 @@ class _OnWorkers(Learner):
         self._direct = True
 
     def observe(self, view: View, operator: ViewOperator | None = None) -> bool:
-        """Add a view and its votes; workers make operators of their own."""
+        """Add a view and its votes; `operator` is ignored, since workers make their own."""
         self.observe_all([view])
         return view.name not in self.rejected
 
     def observe_all(self, views: Sequence[View], progress: Progress = silent) -> None:
         """Add views and their votes; after an error in one of them nothing has changed."""
-        # Whatever becomes of their files: what is taken back, or prepared anew, are the masks that have voted.
+        # Hold the masks: if a file changes, later retraction or preparation must still use the mask that voted.
         named = {view.name: view.held() for view in views}
         if named:
             votes, why = self._sum(dask_worker.sum_votes, named, lambda done: progress("observe", done, len(named)))
@@ -85,9 +85,9 @@ class _OnWorkers(Learner):
         self, task: Callable[..., OverViews], views: Mapping[str, View], report: Done,
         by_view: Mapping[str, Any] | None = None, *values: Any,
     ) -> OverViews:  # fmt: skip
-        """Sum up what a task makes of these views; raises what is wrong with one.
+        """Sum the results of a task over these views; raises the error of a view that fails.
 
-        Raises `SchedulerError` where the scheduler is lost, or all workers, or results again and again.
+        Raises `SchedulerError` if the scheduler or all workers are lost, or if results are lost `ATTEMPTS` times.
         """
         for _ in range(ATTEMPTS):
             used: list[Future] = []
@@ -96,7 +96,7 @@ class _OnWorkers(Learner):
             except (_LostError, CancelledError):
                 self._shares = []
             finally:
-                # Also where `report` has ended the work: what nobody waits for any more is not begun.
+                # Also if `report` raised to stop the work: Dask then does not start pending tasks.
                 for future in used:
                     future.release()
         raise SchedulerError(f"{name_of(self._client)}: lost results {ATTEMPTS} times; expected workers that stay")
@@ -114,7 +114,7 @@ class _OnWorkers(Learner):
             parts.append(self._submit(share.worker, task, share.shard, wanted, *(c[share.worker] for c in copies)))
         used += parts
         sums = deque(parts)
-        while len(sums) > 1:  # What is between leaves and root lives only as long as it is needed there.
+        while len(sums) > 1:  # Workers drop intermediate sums as soon as they are added.
             sums.append(self._client.submit(dask_worker.add, sums.popleft(), sums.popleft(), pure=False))
         used += sums
         sizes = {part.key: len(share.views) for part, share in zip(parts, shares, strict=True)}
@@ -124,7 +124,7 @@ class _OnWorkers(Learner):
         return self._client.gather(sums[0], direct=self._direct)
 
     def _deal(self, views: Mapping[str, View], report: Done) -> list[_Share]:
-        """Have every worker prepare its share of the views, unless they have them."""
+        """Let every worker prepare its share of the views, unless the workers already have them."""
         held = {name: view for share in self._shares for name, view in share.views.items()}
         workers = find_workers(self._client)
         if self._dealt == (workers, self.num_classes) and all(held.get(n) is view for n, view in views.items()):
@@ -144,7 +144,7 @@ class _OnWorkers(Learner):
         return self._shares
 
     def _place_scene(self, workers: Mapping[str, int], report: Done) -> None:
-        """See to it that each worker has the scene: from a file of its own if that is the same one, else from here."""
+        """Give each worker the scene: from the worker's own file if it is the same scene, else sent from here."""
         self._scenes = {w: f for w, f in self._scenes.items() if w in workers and f.status == "finished"}
         absent = [worker for worker in workers if worker not in self._scenes]
         if self.scene.path is not None and absent:
@@ -157,17 +157,17 @@ class _OnWorkers(Learner):
             self._scenes |= self._send(dask_worker.geometry(self.scene), absent)
 
     def _submit(self, worker: str, task: Callable[..., Any], *inputs: Any) -> Future:
-        """Run a task on this worker, or elsewhere should it be lost."""
+        """Run a task on this worker, or on another one if it is lost."""
         import dask
 
-        # A share's masks and error models may exceed the 10 MB from which on Dask warns.
+        # Masks and error models of a share may exceed the 10 MB above which Dask warns.
         with dask.config.set({"distributed.admin.large-graph-warning-threshold": "1 TB"}):
             return self._client.submit(task, *inputs, workers=[worker], allow_other_workers=True, pure=False)
 
     def _send(self, value: Any, workers: list[str]) -> dict[str, Future]:
-        """Put a value on each of these workers: on the first one from here, and from there on along a tree."""
+        """Send a value to each of these workers: from here to the first, and from there along a tree."""
         try:
-            # In a list, since of a tuple Dask would send every element by itself.
+            # In a list, since Dask would send each element of a tuple separately.
             copies: list[Future] = self._client.scatter(
                 [value], workers[:1], direct=self._direct, hash=False, timeout=PATIENCE
             )
@@ -175,9 +175,9 @@ class _OnWorkers(Learner):
             self._direct = False  # Perhaps only the scheduler can reach the workers.
             raise _LostError from error
         except (AssertionError, LookupError, ValueError) as error:
-            # What Dask's scheduler raises, in one place or another, if it hears just then that the worker has gone.
+            # Dask's scheduler raises one of these if it loses the worker at this moment.
             raise _LostError from error
-        # Dask's own broadcast may wait for ever for a worker that has gone.
+        # Not by Dask's broadcast, which may wait for ever for a lost worker.
         for i, worker in enumerate(workers[1:]):
             copies.append(self._submit(worker, dask_worker.hand_on, copies[i // 2]))
         return dict(zip(workers, copies, strict=True))
@@ -206,7 +206,7 @@ class _OnWorkers(Learner):
 class DistributedVotes(_OnWorkers, VoteLearner):
     """`VoteLearner` on the workers of a Dask cluster: `DistributedVotes(client, scene, num_classes)`.
 
-    The scene must be the same that the workers find under its path; else it is sent to them. `memory_budget` is that of
+    Workers that find the same scene under its path load it from there; to others it is sent. `memory_budget` is that of
     each worker. Views are best added together, by `observe_all`.
     """
 
@@ -217,11 +217,11 @@ class DistributedEM(_OnWorkers, EMLearner):
     `memory_budget` is that of each worker. Views are best added together, by `observe_all`.
     """
 
-    checks_masks = False  # which would prepare all views here
+    checks_masks = False  # checking would prepare all views on this machine
 
     def _over_views(
         self, work: Callable[..., OverViews], by_view: Mapping[str, Any], tick: Tick, *arrays: CSRRows | np.ndarray
     ) -> OverViews:
         views = {name: self.views[name] for name in by_view}
-        task = partial(dask_worker.go_over, work, self._possible())  # A share may lack the views that name a class.
+        task = partial(dask_worker.go_over, work, self._possible())  # A worker may lack the views that name a class.
         return self._sum(task, views, lambda done: tick(), by_view, *arrays)

@@ -1,6 +1,6 @@
-"""Tasks of a Dask worker in a distributed run (`dask_learners.py`): it holds some of the views and sums over them.
+"""Tasks of a Dask worker in a distributed run (`dask_learners.py`): it keeps some of the views and sums over them.
 
-A task leaves its inputs as they are, so that it can be run again.
+A task does not change its inputs, so that it can be run again.
 """
 
 from __future__ import annotations
@@ -25,26 +25,26 @@ from gsseg_core.scene.gaussian_scene import GaussianScene
 from gsseg_core.scene.vertices import DC
 from gsseg_core.spatial.row_order import along_curve
 
-ONLY_VOTES = EMSettings(errors=False)  # what is wrong with a mask does not matter to votes
+ONLY_VOTES = EMSettings(errors=False)  # uses masks unchanged, as votes do
 
 _BUSY = threading.Lock()
 
 
 class NotHereError(Exception):
-    """A worker does not have the scene under that path, or has another one there."""
+    """Raised if a worker has no scene, or another scene, at the path."""
 
 
 class Shard(EMLearner):
-    """Some of the views, prepared. Sent elsewhere or spilled to disk, it takes along only what they are prepared of."""
+    """Some of the views in prepared form; pickling leaves out the prepared data, which the views can restore."""
 
     possible: np.ndarray  # (K,) bool: ids that are classes by the views of all workers
 
     def __getstate__(self) -> dict[str, Any]:
-        """Leave the prepared views behind."""
+        """Return the state for pickling, without the prepared views."""
         return {**self.__dict__, "_prepared": self._prepared.emptied()}
 
     def __sizeof__(self) -> int:
-        """Tell Dask how much memory is in use."""
+        """Return the bytes in use, for Dask's memory management."""
         return self._prepared.nbytes[0]
 
     def _possible(self) -> np.ndarray:
@@ -63,7 +63,7 @@ def load(path: str, digest: str) -> GaussianScene:
 
 
 def geometry(scene: GaussianScene) -> GaussianScene:
-    """Leave out of the vertices what no learner needs: all but the colours of degree 0."""
+    """Return the scene without the vertex properties that no learner needs: all but the colours of degree 0."""
     return replace(scene, vertices=repack_fields(scene.vertices[list(DC)]))
 
 
@@ -71,7 +71,7 @@ def prepare(
     scene: GaussianScene, views: Sequence[View], num_classes: int, settings: EMSettings | None,
     where: dict[str, Any],
 ) -> Shard:  # fmt: skip
-    """Prepare views, by settings or, without, for votes; `where` is the learner's device and memory budget."""
+    """Prepare views for EM with `settings`, or for votes if None; `where` is the learner's device and memory budget."""
     shard = Shard(scene, num_classes, settings or ONLY_VOTES, **where)
     shard._votes = VoteTotal(0, num_classes)
     with _all_threads():
@@ -86,7 +86,7 @@ def prepare(
 
 
 def sum_votes(shard: Shard, wanted: dict[str, Any]) -> OverViews:
-    """Count votes; beside them, why a view was rejected, or ""."""
+    """Sum the votes of the wanted views; also return the reason for rejection of each view, or ""."""
     votes = VoteTotal(len(shard.scene), shard.num_classes, along_curve(shard.scene))
     with _all_threads():
         for name in wanted:
@@ -99,7 +99,7 @@ def go_over(
     work: Callable[..., OverViews], possible: np.ndarray, shard: Shard, by_view: dict[str, Any],
     *arrays: CSRRows | np.ndarray,
 ) -> OverViews:  # fmt: skip
-    """Have a method of `EMLearner` go over the views of a shard, as `EMLearner._over_views` does over all."""
+    """Call a method of `EMLearner` for the views of a shard, as `EMLearner._over_views` does for all views."""
     usable = (as_compiled_for(array) if isinstance(array, CSRRows) else array for array in arrays)
     with _all_threads():
         shard.possible = possible
@@ -107,7 +107,7 @@ def go_over(
 
 
 def hand_on(value: Any) -> Any:
-    """Have a worker keep what another one has."""
+    """Return the value unchanged: run on another worker, this copies the value to it."""
     return value
 
 
@@ -122,7 +122,7 @@ def add(one: OverViews, two: OverViews) -> OverViews:
 
 @contextmanager
 def _all_threads() -> Iterator[None]:
-    """One task at a time, with as many threads as the worker was started with."""
+    """Run one task at a time, with as many threads as the worker was started with."""
     from distributed import get_worker
 
     with _BUSY:
@@ -132,5 +132,5 @@ def _all_threads() -> Iterator[None]:
 
 
 def as_compiled_for(rows: CSRRows) -> CSRRows:
-    """Kernels would be compiled once more for arrays that cannot be written to, as those from the network may be."""
+    """Make arrays contiguous and writable, else kernels would be compiled again for read-only ones from the network."""
     return CSRRows(*(np.require(array, requirements=["C", "W"]) for array in rows))

@@ -24,10 +24,7 @@ def spatial_prior(
     weight: float,
     num_classes: int,
 ) -> CSRRows:
-    """Average the probabilities of the k nearest Gaussians, weighted by evidence, and multiply by `weight`.
-
-    A row is empty if none of its neighbours was seen.
-    """
+    """Return `weight` times the evidence-weighted mean of the k nearest Gaussians; rows are empty if none was seen."""
     neighbours = neighbours_of(scene, k) if weight else None
     if neighbours is None:
         return CSRRows.empty(shares.num_rows, np.float32)
