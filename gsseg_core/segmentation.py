@@ -36,7 +36,7 @@ from gsseg_core.spatial.row_order import inverse
 from gsseg_core.text import clipped
 
 T = TypeVar("T")
-_FIRST_ONE = threading.Lock()  # lets only one of several threads compute the codes to blend
+_BLEND_LOCK = threading.Lock()  # lets only one of several threads compute the codes to blend
 
 
 class RenderedLabels(NamedTuple):
@@ -324,7 +324,7 @@ class Segmentation:
         If so, the remaining transmittance of each ray counts as background.
         """
         self.require(operator.scene)
-        with _FIRST_ONE:
+        with _BLEND_LOCK:
             return self._blended
 
     @cached_property

@@ -211,7 +211,7 @@ class Learner(ABC):
         """
 
     def predict_without(self, view: View) -> np.ndarray:
-        """Render class probabilities learnt without the view's own mask, if `leaves_out`: (H, W, K) float32.
+        """Render class probabilities, learnt without the view's own mask if `leaves_out`: (H, W, K) float32.
 
         Call it after `fit`, for a view that `fit` used; a learner that `leaves_out` raises `SettingsError` for others.
         The learner does not change. The K values of a pixel sum to less than 1 where little is known.

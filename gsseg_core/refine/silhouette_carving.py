@@ -117,8 +117,8 @@ def kept_shares(
         shares, stay = np.ones(len(scene), np.float32), np.zeros(len(scene))
         shares[asked], is_asked = kept[asked], np.zeros(len(scene), bool)
         is_asked[asked] = True
-        speak = partial(_reasons_to_stay, scene, labels, device, shares, is_asked)
-        for ids, reasons in several_at_once(speak, known if len(asked) else (), device):
+        weigh = partial(_reasons_to_stay, scene, labels, device, shares, is_asked)
+        for ids, reasons in several_at_once(weigh, known if len(asked) else (), device):
             stay[ids] += reasons
         kept[asked] = np.clip(kept[asked] * stay[asked] / go[asked], _LEAST, 1.0)
         if step == 0:

@@ -83,7 +83,7 @@ def align_boundaries(
     if offset == (0, 0):
         return here.labels
     moved = _align_regions(move_mask(labels, offset), edges, farthest)
-    return moved.labels if moved.tells and moved.evidence - LOG_OFFSETS > here.evidence + CLEAR else here.labels
+    return moved.labels if moved.on_edges and moved.evidence - LOG_OFFSETS > here.evidence + CLEAR else here.labels
 
 
 class _Alignment(NamedTuple):
@@ -91,7 +91,7 @@ class _Alignment(NamedTuple):
 
     labels: np.ndarray  # (H, W) int32
     evidence: float  # log-likelihood of the edges, in nats
-    tells: bool  # whether edges are stronger along the boundaries than elsewhere
+    on_edges: bool  # whether edges are stronger along the boundaries than elsewhere
     beside: np.ndarray  # (P,) int64: pixels along the original boundaries, as flat indices (row-major)
     weights: np.ndarray  # (P,) log-likelihood of an edge of strength 1 at each of these pixels, in nats
 
@@ -109,15 +109,15 @@ def _align_regions(labels: np.ndarray, edges: np.ndarray, farthest: int) -> _Ali
     beside = np.flatnonzero((ring.ravel() == 1) & np.append(moving, False)[pair])
     still = float(log_likelihood[:, most].sum())
     near = slice(farthest, 3 * farthest)  # a boundary may lie this far from its edge
-    tells = bool(strengths[:, near].sum() >= TELLING * sampled(edges).mean() * lengths[:, near].sum())
+    on_edges = bool(strengths[:, near].sum() >= TELLING * sampled(edges).mean() * lengths[:, near].sum())
     aligned, evidence = labels.copy(), still
-    if tells:
+    if on_edges:
         shifts, of_shifts = _shifts(pairs[moving], log_likelihood, len(area), farthest)
         moved = np.where(moving, np.clip(shifts[pairs[:, 0]] - shifts[pairs[:, 1]], -most, most), 0)
         if of_shifts > still + min(CLEAR + EACH_CLEAR * np.count_nonzero(moved), ALL_CLEAR):
             evidence = of_shifts
             _move(region, other, ring, pair, pairs, moved, labels.ravel()[first], aligned)
-    return _Alignment(aligned, evidence, tells, beside, (weights / along)[pair[beside]])
+    return _Alignment(aligned, evidence, on_edges, beside, (weights / along)[pair[beside]])
 
 
 def _shifts(touching: np.ndarray, log_likelihood: np.ndarray, count: int, farthest: int) -> tuple[np.ndarray, float]:

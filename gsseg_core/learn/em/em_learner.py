@@ -198,7 +198,7 @@ class EMLearner(Learner):
                 models |= self._over_views(EMLearner._refit_error_models, models, tick, codes, gradient, prior.data)[1]
                 self.rounds_.append(0)
                 if votes.data.min(initial=0) < 0:
-                    # Votes against classes predict neighbours badly; by now the probabilities do it better.
+                    # Votes against classes say little about neighbours; by now the probabilities are more reliable.
                     codes, gradient, prior = with_prior(codes, gradient, self._spatial_prior(codes, evidence))
             kernels.m_step(codes, gradient, prior.data)
             if self.converged_:
@@ -315,8 +315,8 @@ class EMLearner(Learner):
         """Find the labels of some views that the votes of all other views contradict; `votes` are those of all, int64.
 
         `doubted` has the views to test: None to test all labels of a view, else a mask (L,) bool of the labels to test,
-        whose votes are not part of `votes`. Returns the change of each entry of `votes` that removes the rejected
-        labels, (Z,) int64, and the rejected labels by view, (L,) bool, for views that have any.
+        whose votes are not part of `votes`. Returns minus the votes of the rejected labels, (Z,) int64 for each entry
+        of `votes`, and the rejected labels by view, (L,) bool, for views that have any.
         """
         possible, device = self._possible(), self._device_of(votes)
         votes, backend = rows_on(votes, device)

@@ -1,4 +1,4 @@
-"""Mask offset: how far a whole mask is shifted in its image because of a wrong pose or time stamp.
+"""Mask offset: how far a whole mask is shifted in its image, because its pose is wrong or it is of another moment.
 
 If a camera is rotated by half a degree, its mask is a few px away from the rendered scene. Moving the mask back makes
 all of its boundaries meet edges of the scene. So the search returns the offset at which the boundaries meet the
@@ -34,7 +34,7 @@ def likeliest_offset(
 
 
 def move_mask(labels: np.ndarray, offset: tuple[int, int]) -> np.ndarray:
-    """Move a mask (H, W) by an offset in rows and columns; pixels that it no longer covers become unknown."""
+    """Move a mask (H, W) by an offset in rows and columns; pixels that it no longer covers become `UNKNOWN`."""
     moved = np.full_like(labels, UNKNOWN)
     (to_y, from_y), (to_x, from_x) = map(_overlap, offset)
     moved[to_y, to_x] = labels[from_y, from_x]

@@ -20,7 +20,7 @@ from gsseg_core.scene.scene_cache import PerScene
 
 SQUARE = 4 * BLOCK  # px, side of the squares of the sample, which are tiles of the rasteriser
 EVERY = 3  # the sample takes every third row and column of squares
-SMALL = 448  # px; an image with fewer rows or columns is sampled in all of them
+SMALL = 448  # an image with fewer rows (columns) has all of its rows (columns) in the sample
 STRONGEST = 2.0  # edge strengths are clipped to this many 95th percentiles of the view
 
 _LIGHT: PerScene[tuple[np.ndarray, bool]] = PerScene()
