@@ -67,7 +67,7 @@ class Segmentation:
     learnt : CSRRows
         Probabilities that the `clustered` Gaussians had before, (C, K) float32, in scene order; never calibrated.
     temperature : float
-        Temperature of the probabilities, see `calibrated`; 1 if they are as they were learnt.
+        Temperature that calibrates the probabilities, see `calibrated`; 1 if they are as they were learnt.
     ids : (N,) int64 or None
         Gaussian ids that persist while the scene changes, if it has any; see docs/living_map.md.
     tree : ObjectTree or None
@@ -223,7 +223,7 @@ class Segmentation:
         return replace(self, labels=labels, class_names=dict(enumerate(self.class_names.values())))
 
     def with_ids(self, ids: Sequence[int]) -> Segmentation:
-        """Replace gapless class ids by K different ones, 0 first; `SettingsError` if they are not, or with a tree."""
+        """Replace gapless class ids by K different ones, 0 first; `SettingsError` for other ids, gaps or a tree."""
         names, order = list(self.class_names.values()), np.argsort(ids).tolist()
         fits = all(isinstance(k, int | np.integer) and k <= MAX_LABEL for k in ids)
         if self.tree or not fits or not len(names) == self.num_classes == len(ids) == len({*ids}) or order[0] or ids[0]:
@@ -250,7 +250,7 @@ class Segmentation:
 
     @cached_property
     def probabilities(self) -> np.ndarray:
-        """Class probabilities as a dense array, (N, K) float32: 4 N K bytes, allocated on first access."""
+        """Class probabilities as a dense array, (N, K) float32; only this property needs the 4 N K bytes."""
         return self.shares.dense(len(self.class_names))
 
     @cached_property
@@ -291,7 +291,7 @@ class Segmentation:
     def carved_by(
         self, scene: GaussianScene, views: Iterable[T], look: Callable[[T], Silhouette], device: str = "cpu"
     ) -> Segmentation:
-        """Remove Gaussians that stick out of silhouettes, as `carved` does, for views of any type that `look` takes."""
+        """Remove Gaussians that stick out of silhouettes, as `carved` does; `look` returns the silhouette of a view."""
         self.require(scene)
         return self._without(sticking_out(kept_shares(scene, self.labels, views, look, device=device), self.labels))
 
@@ -311,9 +311,10 @@ class Segmentation:
         return self.class_ids[found.classes], found.beside
 
     def blend(self, operator: ViewOperator) -> np.ndarray:
-        """Blend the learnt probabilities into a view, (H, W, K) float32, uncalibrated; sums are the known pixel share.
+        """Blend the learnt, uncalibrated probabilities into a view, (H, W, K) float32.
 
-        `gsseg_core.learn.temperature.tempered` at `temperature` calibrates them.
+        The K values of a pixel sum to the share of it that is known. `gsseg_core.learn.temperature.tempered` at
+        `temperature` calibrates them.
         """
         codes, shows_background = self._codes_to_blend(operator)
         return operator.blend_probabilities(codes, len(self.class_names), shows_background)

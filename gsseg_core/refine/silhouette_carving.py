@@ -14,9 +14,9 @@ shows k, and 0 where it shows another object that does not hide k. Each Gaussian
 
 These are the two parts of the gradient of log A_k on the object's own pixels and log T_k on the others, with alpha as
 the approximation of -log(1 - alpha). x_i <- min(1, x_i stay_i / go_i) is the multiplicative step of expectation
-maximisation for such sums (Shepp and Vardi 1982). Where other Gaussians cover the object anyway, T_k is small and there
-is little reason to stay. A Gaussian that is the only cover of some pixels stays although it sticks out. One that never
-sticks out, or that no view reaches, stays.
+maximisation for such sums (Shepp and Vardi 1982). Where other Gaussians of the object cover a pixel anyway, T_k is
+small and there is little reason to stay. A Gaussian that alone covers some pixels of its object stays although it
+sticks out. One that never sticks out, or that no view reaches, stays.
 """
 
 from __future__ import annotations

@@ -30,7 +30,7 @@ BLOCKS = 16  # counts are summed in this fixed number of parts, so that results 
 _AT_ONCE = 1 << 23  # entries of such parts to hold in memory at a time; at least one part is held
 
 GRADIENT_UNIT = 2.0**-24
-"""Unit of gradients, in px: integer sums depend neither on the order of views nor on the device or worker."""
+"""Unit of gradients, in px: integer sums depend neither on the order of views nor on where these are added."""
 
 _GRADIENT_UNIT = np.float32(GRADIENT_UNIT)
 
