@@ -149,27 +149,27 @@ def machine() -> str:
 
 HEADER = """# Results
 
-Made by `make results` (`python benchmarks/results.py`), which measures everything here again.
+`make results` (`python benchmarks/results.py`) measures everything on this page again and writes it.
 Machine: {machine}.
 
 `replica_apartment` is one floor of a real scanned apartment (Replica `apartment_0`): 126,507 Gaussians trained by
-OpenSplat, 40 objects, 105 views of 320 x 320 to learn from and 14 to score on. The other three are made up, of free
-splats of objects that touch, stand on and hide each other, and were trained anew from photos of that: 33,000 to
-95,000 Gaussians, 12 to 16 objects, 66 and 12 views. The wrong masks have 15 % of the objects missed and 10 % under
-another id in every view, and edges off by up to 3 px. Scores are of the test views against the true masks; no learner
-saw either.
+OpenSplat, 40 objects, 105 views of 320 x 320 to learn from and 14 to score on. The other three scenes were composed
+from freely available splats of objects that touch, stand on and hide each other, and trained anew from renderings of
+that: 33,000 to 95,000 Gaussians, 12 to 16 objects, 66 views to learn from and 12 to score on. In the wrong masks, every
+view misses 15 % of the objects, has 10 % under another id, and has edges off by up to 3 px. All scores compare the test
+views with their true masks; no learner saw either.
 
-The settings of `em` were chosen on train views that were held out from learning, or compared there with other values,
-of all development scenes together ([em_settings.md](em_settings.md)); none stands on test views.
+The settings of `em` were chosen on held-out train views of all development scenes together, or compared there with
+other values ([em_settings.md](em_settings.md)); none was chosen on test views.
 
-Other tables: which step of `em` helps where, [regret.md](regret.md); objects cut out, with every kind of refinement,
-[clean_objects.md](clean_objects.md); masks without common ids, [ids.md](ids.md).
+Other tables: [regret.md](regret.md) shows which step of `em` helps where, [clean_objects.md](clean_objects.md) compares
+refinements of cut-out objects, and [ids.md](ids.md) covers masks without common ids.
 """
 
 LEARNERS = """## Learners
 
-Rendered label maps, without refinement. "Votes made hard" is FlashSplat's rule without its background bias. Seconds are
-of learning, with the reading and preparing of the views.
+Scores are those of rendered label maps, without refinement. "Votes made hard" is FlashSplat's rule without its
+background bias. Seconds cover reading and preparing the views, and learning.
 
 {table}
 """
@@ -181,16 +181,16 @@ COMMAND = """## The whole command
 gsseg segment replica_apartment/scene.ply --data replica_apartment --out out
 ```
 
-In a process of its own, with refinement, export, pictures and report, its kernels compiled before; then `gsseg render`
-and `gsseg eval` on the test views.
+The command runs in its own process with kernels already compiled, and includes refinement, export, pictures and report.
+`gsseg render` and `gsseg eval` then score it on the test views.
 
 {table}
 
 ## What is measured
 
-Per class, over all test views together. IoU: intersection / union of pixels. Accuracy: share of the class's true pixels
-that were found. Boundary IoU: the IoU of bands along the inside of the outlines, as wide as 2 % of the image diagonal.
-Means are over all ids that occur in the truth or in the prediction; that of accuracy over those in the truth.
+Scores are per class, over all test views together. IoU is intersection / union of pixels. Accuracy is the share of the
+class's true pixels that were found. Boundary IoU is the IoU of bands along the inside of the outlines, as wide as 2 %
+of the image diagonal. mIoU averages all ids that occur in the truth or in the prediction, mAcc those in the truth.
 """
 
 if __name__ == "__main__":
