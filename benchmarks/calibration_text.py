@@ -2,31 +2,34 @@
 
 HEADER = """# Calibration: what confidence means
 
-Made by `python benchmarks/calibration.py`, which measures everything here again.
+`python benchmarks/calibration.py` measures everything on this page again and writes it.
 Machine: {machine}.
 
-Of all pixels (or Gaussians) with a confidence of 0.8, eight in ten should be right: belong to the true class, whatever
-the masks said that were learnt from. What learners and blending give are shares, which are not sure enough: a pixel
-that is made to 0.7 of one object belongs to it far more often than in seven cases of ten, and where the masks are wrong
-in a quarter of the cases, votes hardly ever exceed 0.75, however many views agree.
+Of all pixels (or Gaussians) with a confidence of 0.8, eight in ten should be right, that is, belong to their true class
+even if masks were wrong. Learners and blending compute shares, which are underconfident. A pixel with a share of 0.7 of
+one object belongs to it in far more than seven cases of ten. If a quarter of the masks are wrong, votes hardly ever
+exceed 0.75, however many views agree.
 
 ## How it is done
 
-One number per scene, the temperature T. Shares O become probabilities
+One number per scene, the temperature T, turns shares O into probabilities
 
     P[k] = O[k]^(1/T) / sum_j O[j]^(1/T)
 
-For a Gaussian, O are the class probabilities as learnt; for a pixel, what these blend to. (What is blended is always
-what was learnt, never probabilities at T.) The order of the classes stays, so labels, label maps and mIoU stay too.
-Raising shares to a power is what it means to weigh evidence: n pixels that saw a Gaussian are not n independent
-observations, since those of one view err together; T says how much they are worth all the same.
+For a Gaussian, O are the learnt class probabilities; for a pixel, O are these probabilities blended. (Blending always
+uses the learnt probabilities, never those at T.) The order of the classes does not change, so labels, label maps and
+mIoU do not change either. Raising shares to a power weighs the evidence: n pixels that saw a Gaussian are not n
+independent observations, since the pixels of one view err together. T expresses how many they are worth.
 
-T is found without any truth. Of at most 16 views, spread evenly, the mask is predicted from the other views: for `em`
-by probabilities without the view's own summand (those of "check views", so nothing is rendered twice), for `votes` by
-the votes of the others, exactly. T maximises the likelihood of these masks. What is wanted is the probability of the
-true class and not that of a wrong label, so each mask is seen through a confusion matrix of its own, learnt anew at
-every T that is tried. `gradient` has no such step; there the masks are predicted by probabilities that were fitted to
-them, one view among many. In all cases 2,048 pixels of a view are enough, and the result is the same in every run.
+T needs no ground truth. gsseg takes at most 16 views, spread evenly, predicts the mask of each from the other views,
+and chooses the T that maximises the likelihood of these masks:
+
+- `em` predicts by probabilities without the view's own term. The stage "check views" has them, so nothing is rendered
+  twice. `votes` predicts by exactly the votes of the other views. `gradient` cannot leave a view out: it predicts by
+  probabilities that were also fitted to the mask, one view among many.
+- T should give the probability of the true class, not of a wrong label. So each mask has its own confusion matrix,
+  estimated again for every T that is tried.
+- 2,048 pixels of a view are enough, and the result is the same in every run.
 
 | where | what is calibrated |
 |---|---|
@@ -35,7 +38,7 @@ them, one view among many. In all cases 2,048 pixels of a view are enough, and t
 | `report.json` | mean confidences; `calibration`: temperature, its views and pixels, the share left `unknown` |
 | `Segmentation` | `probabilities`, `confidence`, `render(...).confidence`; `blend` gives the shares |
 | ROS, after `~/learn` | clouds, reports, `~/render_view`, `min_confidence`: by the temperature of what was learnt |
-| ROS, votes alone, before `~/learn` | not calibrated: shares, less sure than they might be |
+| ROS, votes alone, before `~/learn` | not calibrated: shares, which are underconfident |
 | KNN's `beta` | acts on shares, before calibration, as in the paper |
 
 With soft or partial masks, T is fitted to the pixels for which the mask names a class.
@@ -43,13 +46,17 @@ With soft or partial masks, T is fitted to the pixels for which the mask names a
 
 SCORES = """## On the test views
 
-Learnt from all train views, scored on the test views against their true masks, all pixels of all views together. ECE:
-15 bins of equal width over the confidence of the class predicted, sum of share times |accuracy - confidence|. AURC:
-mean share of wrong pixels over all coverages, the surest pixels first. Of Gaussians: the same ECE, each Gaussian
-weighted by the pixels that see it; right is one whose most probable class is that of probabilities that EM without
-error models learnt from the true masks of all views, test views too. "As blended" is T = 1, before calibration. Wrong
-masks: 15 % of the objects missed, 10 % under another id in every view, edges off by up to 3 px (the apartment's), and
-those of `make demo`.
+Everything is learnt from all train views and scored on the test views against their true masks, with the pixels of all
+views together.
+
+- **ECE**: 15 bins of equal width over the confidence of the predicted class; sum of share times |accuracy -
+  confidence|.
+- **AURC**: mean share of wrong pixels over all coverages, the most confident pixels first.
+- **ECE of Gaussians**: the same, each Gaussian weighted by the pixels that see it. A Gaussian counts as right if its
+  most probable class is the one that EM without error models learns from the true masks of all views, test views too.
+- **As blended**: T = 1, before calibration.
+- **Wrong masks**: every view misses 15 % of the objects, has 10 % under another id, and has edges off by up to 3 px
+  (the apartment's); those of the demo are those of `make demo`.
 
 {table}
 
@@ -60,13 +67,13 @@ those of `make demo`.
 
 ROADS = """## Ways to choose the temperature
 
-On one train view in seven, held out from learning, against their true masks: ECE, and T. *Masks taken as true* takes
-every label of a held-out mask for the true class. *Through confusion* is what is built in. *Best possible* is fitted to
-the true masks of the held-out views themselves, which nobody has at run time.
+The table has ECE, and T, against the true masks of one train view in seven, held out from learning. *Masks taken as
+true* treats every label of a held-out mask as the true class. *Through confusion* is what gsseg does. *Best possible*
+is fitted to the true masks of the held-out views themselves, which nobody has at run time.
 
 {table}
 
-With true masks, taking them as true is as good as the confusion matrices. With wrong ones it makes confidences those of
-the wrong label; the confusion matrices repair it, for the most part: edges that are off look to them like unsure
-predictions, so T comes out somewhat too high.
+With true masks, taking them as true is as good as the confusion matrices. With wrong masks, it calibrates to the wrong
+labels. The confusion matrices correct most of this; they take shifted edges for uncertain predictions, so T is somewhat
+too high.
 """

@@ -146,31 +146,32 @@ TEXT = """# Objects cut out of the scene
 gsseg remove scene.ply --segmentation out/segmentation.npz --class chair --out without_chair.ply
 ```
 
-Writes a valid 3DGS PLY, or another [format](formats.md) by the suffix of `--out` or by `--format`; in Python it is
-`gsseg_core.objects.removal.without_objects`. The objects' PLYs and what is left make up the scene, Gaussian for
-Gaussian. What an object hid, no camera has seen: holes are left as they are.
-Gaussians that refinement took out of an object stay in the scene.
+This writes a valid 3DGS PLY, or another [format](formats.md) by the suffix of `--out` or by `--format`; in Python, call
+`gsseg_core.objects.removal.without_objects`. The objects' PLYs and the remaining scene together contain every Gaussian
+exactly once. No camera saw what an object hid, so holes may remain; gsseg does not fill them. Gaussians that refinement
+took out of an object stay in the scene.
 
 ## What goes wrong, and what is done
 
-The labels of most Gaussians are right, but an object cut out is larger than in its masks: Gaussians across its edge, of
-which others hid a part, show in full, and so do those just under a neighbour's surface.
+The labels of most Gaussians are right, but a cut-out object is larger than in its masks. Gaussians across its edge,
+partly hidden in the scene, show in full, and so do Gaussians just under a neighbour's surface.
 
-- **KNN** gives unobserved and unsure Gaussians to what is around them (`--no-knn`: leaves them).
-- **The paper's filter** (`--refine paper`, and what the node publishes) removes whatever is farther from its fellows
-  than mu + sigma. Where Gaussians are large and sparse this takes away good ones.
-- **Carving** (the default, `gsseg_core.refine.silhouette_carving`) drops the Gaussians that stick out of the
-  silhouettes in 24 train views, unless the object would have holes without them. The silhouettes are those of the label
-  maps that the segmentation itself renders, so errors of single masks carve nothing away; no retraining. What no view
-  reaches stays, and no object goes as a whole. Where objects touch, it may take a little of the object itself.
-  Large views that are not drawn anyway are looked at with 131,072 pixels, about as many as the views of the scenes here
-  have: on held-out views, two or three times as many along each side changed visible IoU by 0.1 points and less, save
-  for kitchen_table from true masks (+0.4); 0.85 of them cost up to 0.3 points from wrong masks, 0.7 of them up to 1.1.
+- **KNN** labels unobserved and uncertain Gaussians by their neighbours (`--no-knn` leaves them).
+- **The paper's filter** (`--refine paper`, and what the node publishes) removes Gaussians that are farther from the
+  others of their object than mu + sigma. Where Gaussians are large and sparse, it also removes good ones.
+- **Carving** (the default, `gsseg_core.refine.silhouette_carving`) drops Gaussians that stick out of the silhouettes in
+  24 train views, unless the object would have holes without them. The silhouettes come from the label maps that the
+  segmentation itself renders, so errors of single masks carve nothing away. It needs no retraining. Gaussians that no
+  view reaches stay, and no object disappears as a whole. Where objects touch, carving may remove a little of the object
+  itself. Large views that are not drawn anyway are reduced to 131,072 pixels, about the size of the views of the scenes
+  here. On held-out views, two or three times as many pixels along each side changed visible IoU by 0.1 points or less,
+  except for kitchen_table from true masks (+0.4). With 0.85 of them along each side, it cost up to 0.3 points from
+  wrong masks, with 0.7 up to 1.1.
 
-Carving takes two steps ([method.md](method.md#refinement)). All shares move at once and overshoot, so that five, as
-there were, are no better on held-out views, and take two and a half times the CPU time: 0.93 s against 0.39 s on the
-demo, 1.41 s against 0.55 s in the apartment. Visible IoU from wrong masks, five steps and two, when a Gaussian had to
-keep 0.5 of the largest share, not 0.4 as now:
+Carving takes two steps ([method.md](method.md#refinement)). All shares move at once and overshoot, so the five steps of
+an earlier version are no better on held-out views, and take two and a half times the CPU time: 0.93 s against 0.39 s on
+the demo, 1.41 s against 0.55 s in the apartment. The table compares visible IoU from wrong masks with five and with two
+steps. At that time, a Gaussian had to keep 0.5 of the largest share, not 0.4 as now:
 
 | views | demo | apartment | shelf | kitchen_table | workbench |
 | --- | --- | --- | --- | --- | --- |
@@ -179,34 +180,37 @@ keep 0.5 of the largest share, not 0.4 as now:
 | test views, 5 steps | 0.966 | 0.894 | 0.963 | 0.953 | 0.957 |
 | test views, 2 steps | 0.966 | 0.897 | 0.966 | 0.955 | 0.959 |
 
-A Gaussian goes below 0.4 of the largest share in its object. On held-out train views, mean over the five scenes and
-both kinds of masks, visible IoU is so 0.09 points above what 0.5 gives (from -0.05 on the demo's true masks to +0.33 on
-the kitchen table's), with 0.3 it is 0.06 above, with 0.6 0.12 below. The whole loses 0.06 points.
+Carving drops a Gaussian below 0.4 of the largest share in its object. On held-out train views, averaged over the five
+scenes and both kinds of masks, visible IoU is then 0.09 points higher than with 0.5 (from -0.05 with the demo's true
+masks to +0.33 with the kitchen table's). With 0.3 it is 0.06 points higher than with 0.5, with 0.6 it is 0.12 lower.
+Whole IoU loses 0.06 points.
 
 **Shortening** the longest axis of Gaussians whose ends lie outside their silhouettes in most views (VCAR, arXiv
-2608.30870) is not done: after carving, 4 to 40 Gaussians of each made-up scene are like that, and 500 to 1,300 of the
-apartment's. No way of weighing views, ends and axes that was tried gained visible IoU: 0.01 points at best.
+2608.30870) is not part of gsseg. After carving, only 4 to 40 Gaussians of each synthetic scene are like that, and 500
+to 1,300 of the apartment's. No weighting of views, ends and axes that we tried gained more than 0.01 points of visible
+IoU.
 
 ## What is measured
 
-The silhouette of an object is where its own Gaussians, rendered alone, accumulate an alpha above 0.5. It is compared
-with the true mask of the object: IoU, and boundary IoU with bands as wide as 2 % of the image diagonal. Pixels are
-summed over the views per object; means are over all objects that the truth shows. The background is no object.
+The silhouette of an object covers the pixels where its own Gaussians, rendered alone, accumulate an alpha above 0.5. It
+is compared with the true mask of the object by IoU, and by boundary IoU with bands as wide as 2 % of the image
+diagonal. Pixels are summed over the views per object; means are over all objects that the truth shows, without the
+background.
 
-A mask shows only what is visible of an object. So there are two scores, both by `benchmarks/object_scores.py`:
+A mask shows only the visible part of an object. So `benchmarks/object_scores.py` computes two scores:
 
-- **visible**: a pixel of another label does not count where the object lies behind the surface of the scene, that is
-  where its depth is above that of the whole scene by more than 2 %. What sticks out in front or beside counts.
+- **visible**: a pixel of another label does not count where the object lies behind the surface of the scene, that is,
+  where its depth exceeds that of the whole scene by more than 2 %. Parts that stick out in front or beside count.
 - **whole**: every pixel counts. An object half hidden by others scores badly here, however clean it is.
 
 ## Scores
 
-Made by `python benchmarks/objects.py`, which measures everything here again.
+`python benchmarks/objects.py` measures everything on this page again and writes it.
 Machine: {machine}.
 
-Learnt by `em` from the train views, with true masks and with wrong ones (the demo's own, and `labels_noisy` of the
-others); scored in the {views} against the true masks. Settings were chosen on train views that were held out
-from learning, as `--held-out` does it.
+`em` learns from the train views, with true masks and with wrong ones (the demo's own, and `labels_noisy` of the other
+scenes). Scores compare the {views} with the true masks. Settings were chosen on held-out train views, as `--held-out`
+does it.
 
 {table}
 
@@ -214,19 +218,20 @@ from learning, as `--held-out` does it.
 
 ## How much there is to gain
 
-Three kinds of rows are no refinement, as they go by the truth:
+Three kinds of rows are bounds and not refinements, since they use the true masks:
 
-- **carving, by true masks** of the views that it looks at, in place of the label maps that the segmentation renders;
+- **carving, by true masks** carves by the true masks of its views, not by the label maps that the segmentation renders;
 - **chosen by the truth of the train views**: each object keeps those of its own Gaussians whose silhouettes fit these
-  true masks best. `benchmarks/object_ceiling.py` goes through the Gaussians one after the other and stops at a local
-  optimum, so a better choice may exist; and it fits the visible score only;
-- **chosen by the truth**: the same by the true masks of the very views that are scored, the headroom of any choice
-  among the Gaussians, with no retraining.
+  true masks best. `benchmarks/object_ceiling.py` tests one Gaussian after the other and stops at a local optimum, so a
+  better choice may exist; it fits the visible score only;
+- **chosen by the truth**: the same with the true masks of the scored views themselves, to estimate the most that any
+  choice among the Gaussians could gain without retraining.
 
-What is lost in the demo is a rim less than a pixel wide around each object, since discs on a curved surface stick out
-at its outline, and from wrong masks some of the table at an object's foot. Little of that can be told from train views:
-by their true masks, which nobody has, carving would gain 0.3 points of visible IoU at most, and in the apartment 0.8
-from true masks and 1.9 from wrong ones; the best choice of Gaussians 0.1 to 0.7, and there 1.5 and 2.4.
+In the demo, the loss is a rim less than a pixel wide around each object, since discs on a curved surface stick out at
+its outline, and, from wrong masks, some of the table at an object's foot. Train views can correct little of that. With
+their true masks, which nobody has, carving would gain at most 0.3 points of visible IoU in the demo, and 0.8 (true
+masks) and 1.9 (wrong masks) in the apartment. The best choice of Gaussians would gain 0.1 to 0.7 in the demo, and 1.5
+and 2.4 in the apartment.
 """
 
 if __name__ == "__main__":
