@@ -16,8 +16,8 @@ Machine: {machine}.
 CURVES = """## How many views must be labelled
 
 The views are drawn at random {draws} times, the same for all rows, with true masks. The tables have the mIoU of label
-maps of {scored}: mean and range of the draws. Classes that no labelled view shows count as 0, which limits the figure for
-one view. All rows have KNN clustering; "+ graph" has `gsseg_core.refine.label_propagation` before it.
+maps of {scored}: mean and range of the draws. Classes that no labelled view shows count as 0, which limits the figure
+for one view. All rows have KNN clustering; "+ graph" has `gsseg_core.refine.label_propagation` before it.
 
 ![mIoU by number of views](pictures/few_views.svg)
 
