@@ -56,7 +56,7 @@ class GradientLearner(Learner):
     - Loss of one class (eq. 3): L_i = -1/N sum_n M_i^n log M_bar_i^n over the N pixels with a label.
     - Loss of one view and of all (eq. 4): CES = 1/K sum_i L_i, and the mean of CES over the L views.
 
-    Choices that the paper leaves open:
+    Where the paper is silent, we chose:
 
     - The softmax of the codes is taken before blending. So rendered codes are probabilities up to the remaining
       transmittance, which counts as class 0. (The paper takes the softmax in its clustering step, and mentions
