@@ -147,11 +147,11 @@ TEXT = """# Settings of em
 
 Made by `python benchmarks/em_settings.py`. Machine: {machine}.
 
-What other values of its settings would give `em`, in points of mIoU against what it has: mean, worst and best over six
-scenes, each with several kinds of masks ([regret.md](regret.md) says which). Every seventh train view was held out from
-learning, and scored against true masks; no test view was looked at. From `SHARPNESS` on they are those of
-`gsseg_core/learn/em/boundary_alignment.py`, `CLAIMED` is that of `gsseg_core/learn/em/rejected_regions.py`, the others
-are of `EMSettings`.
+The table shows how other values of its settings would change the mIoU of `em`, in points: mean, worst and best over six
+scenes, each with several kinds of masks ([regret.md](regret.md) lists them). Every seventh train view was held out from
+learning and scored against true masks; test views were not used. Settings from `SHARPNESS` on are in
+`gsseg_core/learn/em/boundary_alignment.py`, `CLAIMED` is in `gsseg_core/learn/em/rejected_regions.py`, the others are
+in `EMSettings`.
 
 {table}
 """

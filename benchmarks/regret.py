@@ -151,19 +151,18 @@ HEADER = """# Regret
 
 Made by `python benchmarks/regret.py --test`. Machine: {machine}.
 
-A step of a learner that helps on wrong masks may cost something on right ones. The regret of `em` is what the best of
-all other learners, or of `em` without some of its steps, has more, in points of mIoU (rendered label maps of the test
-views against true masks, without refinement); 0 where `em` is the best.
-At worst it is {worst}.
+A step of a learner that helps with wrong masks may hurt with right ones. The regret of `em` is the difference between
+the best of all other learners, and of `em` without some of its steps, and `em` itself: in points of mIoU (rendered
+label maps of the test views against true masks, without refinement), 0 where `em` is the best. At worst it is {worst}.
 
-- *votes*, *hard votes* (FlashSplat's rule), *plain em* (without error models), *matrices alone* (`em` with error
-  models, and no region of a mask rejected); each from masks as they came, and from masks that are moved to edges of the
-  scene as `em` does it ([method.md](method.md)). The last column is `em` with regions rejected and masks as they came.
+- Learners: *votes*, *hard votes* (FlashSplat's rule), *plain em* (without error models), *matrices alone* (`em` with
+  error models, but without rejected regions); each from masks as they came, and from masks that are moved to edges of
+  the scene as in `em` ([method.md](method.md)). The last column is `em` with rejected regions and masks as they came.
 - Masks: true; as given (those that lie beside the scene: 15 % of objects missed in every view, 10 % under another id,
   edges off by up to 3 px); an own draw of the same errors; and, drawn from true ones, one kind of error alone at the
   strength {strengths} ([robustness.md](robustness.md)).
 - Scenes: the demo; a garden (`benchmarks/garden.py`), whose objects have soft outlines; one real floor,
-  `replica_apartment`; three made-up, lifelike ones. Whether a mask is moved was settled on train views of all six
+  `replica_apartment`; three lifelike synthetic ones. When a mask is moved was chosen on train views of all six
   (`CLEAR`, `EACH_CLEAR` and `ALL_CLEAR` in `gsseg_core/learn/em/boundary_alignment.py`).
 
 {table}
