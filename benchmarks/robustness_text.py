@@ -53,7 +53,7 @@ RELIABILITY = """## Which masks to trust
 
 A view's *reliability* is the share of its pixels whose label the other views predict: `MaskChecker` takes one step of
 EM from the learnt probabilities, without the term of this view. Here every view has errors of random strength, up to
-those above. In addition, a fifth of the views is bad: half of the objects or more exchange ids, all ids move on by one,
+those above. In addition, a fifth of the views is bad: half of the objects or more exchange ids, no object keeps its id,
 half of the objects or more are missed, or the mask is shifted by 30 to 60 px times a random share.
 
 "Worst found" is how many of the fifth of the views with the fewest right pixels are among the least reliable fifth.
