@@ -205,7 +205,7 @@ A mask shows only the visible part of an object. So `benchmarks/object_scores.py
 
 ## Scores
 
-`python benchmarks/objects.py` measures everything on this page again and writes it.
+`python benchmarks/objects.py` measures the table below again, and writes this page and its picture.
 Machine: {machine}.
 
 `em` learns from the train views, with true masks and with wrong ones (the demo's own, and `labels_noisy` of the other

@@ -1,4 +1,4 @@
-"""An executor that goes on where what has come cannot be taken in."""
+"""An executor that continues after a message, a request or an event that cannot be processed."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ InvalidHandle = rclpy_implementation.InvalidHandle
 
 
 class EnduringExecutor(Executor):
-    """Loses a message, a request or an event that cannot be taken in, and goes on with all others.
+    """Loses a message, a request or an event that cannot be processed, and continues with all others.
 
     rclpy keeps its callback group busy for good, and raises the error where it spins: a single message for which there
     was too little memory, and the node would hear nothing any more.
